@@ -1,0 +1,117 @@
+"""Agents: what learns. A new agent is one file and one line in `AGENTS`."""
+
+import dataclasses
+import difflib
+from typing import Any, Protocol
+
+from jaxtyping import Array, Bool, Float, Key
+
+from beliefrl.agents.vrm import VRMAgent
+from beliefrl.types import Spec, Step, UserError, Window, WindowShape
+
+Metrics = dict[str, Float[Array, ""]]
+
+
+class Agent(Protocol):
+    """A frozen dataclass of hyperparameters whose methods are pure functions.
+
+    A training explores for `step_start_rl` steps with the untrained policy, calls `pretrain` `pretrain_updates` times,
+    and then goes in cycles of `cycle` steps: `begin_cycle` once, `update` after every `train_interval_rl` steps.
+    """
+
+    @property
+    def step_start_rl(self) -> int: ...
+    @property
+    def train_interval_rl(self) -> int: ...
+    @property
+    def pretrain_updates(self) -> int: ...
+    @property
+    def cycle(self) -> int: ...
+    @property
+    def window(self) -> WindowShape:
+        """The windows that all of the methods below are given."""
+        ...
+
+    @property
+    def pretrain_windows(self) -> int:
+        """How many of them `pretrain` is given."""
+        ...
+
+    @property
+    def cycle_windows(self) -> int:
+        """How many of them `begin_cycle` is given."""
+        ...
+
+    def init(self, key: Key[Array, ""], spec: Spec) -> Any:
+        """The state before training: networks and optimisers."""
+        ...
+
+    def reset(self) -> Any:
+        """The empty memory of one actor."""
+        ...
+
+    def act(
+        self, state: Any, memory: Any, step: Step, key: Key[Array, ""], explore: Bool[Array, ""]
+    ) -> tuple[Float[Array, " action"], Any]:
+        """Perceive a moment; returns the action (a sample, or the mode where not `explore`) and the new memory."""
+        ...
+
+    def note(self, memory: Any) -> Any:
+        """What the replay shall keep of a memory beside the moment that it has just perceived."""
+        ...
+
+    def pretrain(self, state: Any, windows: Window, key: Key[Array, ""]) -> tuple[Any, Metrics]:
+        """One update of the pre-training."""
+        ...
+
+    def begin_cycle(self, state: Any, windows: Window, key: Key[Array, ""]) -> tuple[Any, Any, Metrics]:
+        """What is done once a cycle; the second result is a batch for every `update` to come (leading axis)."""
+        ...
+
+    def update(self, state: Any, batch: Any, key: Key[Array, ""]) -> tuple[Any, Metrics]:
+        """One update of the controller."""
+        ...
+
+
+AGENTS: dict[str, type] = {
+    "vrm": VRMAgent,
+}
+
+
+def names() -> dict[str, str]:
+    """Every agent's name with a sentence on it."""
+    return {name: (agent.__doc__ or "").split("\n")[0] for name, agent in AGENTS.items()}
+
+
+def find(name: str) -> type:
+    """The class of the agent of that name.
+
+    Raises:
+        UserError: no agent has that name.
+    """
+    if name not in AGENTS:
+        near = difflib.get_close_matches(name, AGENTS, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"there is {', '.join(AGENTS)}."
+        raise UserError(f"There is no agent {name!r}: {hint}")
+    return AGENTS[name]
+
+
+def make(name: str, **hyperparameters: Any) -> Agent:
+    """The agent of that name; `hyperparameters` replace its defaults.
+
+    Raises:
+        UserError: no agent has that name, it has no such hyperparameter, or a value is impossible.
+    """
+    agent = find(name)
+    known = [field.name for field in dataclasses.fields(agent)]
+    for given in hyperparameters:
+        if given not in known:
+            near = difflib.get_close_matches(given, known, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"it has {', '.join(known)}."
+            raise UserError(f"The agent {name} has no hyperparameter {given!r}: {hint}")
+    return agent(**hyperparameters)
+
+
+def name_of(agent: Agent) -> str:
+    """The name under which `make` finds an agent's class."""
+    return next(name for name, known in AGENTS.items() if type(agent) is known)

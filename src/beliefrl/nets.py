@@ -1,0 +1,102 @@
+"""Building blocks of every network here: perceptrons, the LSTM's gates, Gaussians plain and squashed by tanh.
+
+All are written for one example and mapped over batches from outside. Layers start as PyTorch's do:
+weights and biases uniform in ±1/√fan_in (Equinox's Linear), an LSTM's in ±1/√size.
+"""
+
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
+
+LOG_2PI = 1.8378770664093453
+TANH_EPSILON = 1e-6  # keeps the log-probability of a squashed action finite at ±1
+
+
+class MLP(eqx.Module):
+    """Linear layers with an activation between them, none after the last."""
+
+    layers: tuple[eqx.nn.Linear, ...]
+    activation: Callable[[Array], Array] = eqx.field(static=True)
+
+    def __init__(self, sizes: Sequence[int], activation: Callable[[Array], Array], key: Key[Array, ""]):
+        """`sizes` are the widths from input to output, at least two."""
+        keys = jax.random.split(key, len(sizes) - 1)
+        self.layers = tuple(eqx.nn.Linear(m, n, key=k) for m, n, k in zip(sizes, sizes[1:], keys, strict=False))
+        self.activation = activation
+
+    def __call__(self, x: Float[Array, " input"]) -> Float[Array, " output"]:
+        return self.rest(self.layers[0](x))
+
+    def rest(self, first: Float[Array, " hidden"]) -> Float[Array, " output"]:
+        """The output, from what the first layer gave: for callers that computed that product elsewhere."""
+        for layer in self.layers[1:]:
+            first = layer(self.activation(first))
+        return first
+
+
+@jax.custom_vjp
+def lstm_state(gates: Float[Array, "*lead 4*d"], c: Float[Array, "*lead d"]) -> tuple[Array, Array]:
+    """(d, c) of the next step from the gates' pre-activations i, f, g, o, each (*lead, d):
+
+    c' = σ(f) c + σ(i) tanh g,   d' = σ(o) tanh c'
+
+    One tanh serves all four, as σ(x) = ½ tanh(x/2) + ½: XLA vectorises it over the whole array, which it does not
+    do for four functions of slices (5 times slower); the gradient is written out for the same reason.
+    """
+    return _lstm_forward(gates, c)[0]
+
+
+def _lstm_forward(gates, c):
+    half = 0.5 * gates
+    size = c.shape[-1]
+    is_g = (jnp.arange(4 * size) // size == 2).reshape((1,) * (gates.ndim - 1) + (-1,))
+    squashed = jnp.tanh(jnp.where(is_g, gates, half))
+    i, f, g, o = jnp.split(squashed, 4, axis=-1)
+    i, f, o = (0.5 * gate + 0.5 for gate in (i, f, o))
+    c_next = f * c + i * g
+    tanh_c = jnp.tanh(c_next)
+    return (o * tanh_c, c_next), (i, f, g, o, c, tanh_c)
+
+
+def _lstm_backward(saved, cotangents):
+    i, f, g, o, c, tanh_c = saved
+    by_d, by_c = cotangents
+    by_c = by_c + by_d * o * (1 - tanh_c**2)
+    by_gates = (by_c * g * i * (1 - i), by_c * c * f * (1 - f), by_c * i * (1 - g**2), by_d * tanh_c * o * (1 - o))
+    return jnp.concatenate(by_gates, axis=-1), by_c * f
+
+
+lstm_state.defvjp(_lstm_forward, _lstm_backward)
+
+
+def gaussian_log_prob(
+    x: Float[Array, "*shape"], mean: Float[Array, "*shape"], sigma: Float[Array, "*shape"]
+) -> Float[Array, "*shape"]:
+    """log N(x; μ, σ²), entry by entry."""
+    return -0.5 * (((x - mean) / sigma) ** 2 + LOG_2PI) - jnp.log(sigma)
+
+
+def gaussian_kl(
+    mean_q: Float[Array, "*shape"],
+    sigma_q: Float[Array, "*shape"],
+    mean_p: Float[Array, "*shape"],
+    sigma_p: Float[Array, "*shape"],
+) -> Float[Array, "*shape"]:
+    """D_KL(q ‖ p) of two Gaussians, entry by entry: log σ_p/σ_q + ((μ_q - μ_p)² + σ_q²) / 2σ_p² - ½.
+
+    The paper prints the logarithm's argument upside down; this is the divergence, which is never negative.
+    """
+    return jnp.log(sigma_p / sigma_q) + ((mean_q - mean_p) ** 2 + sigma_q**2) / (2 * sigma_p**2) - 0.5
+
+
+def tanh_gaussian(
+    mean: Float[Array, " action"], log_sigma: Float[Array, " action"], noise: Float[Array, " action"]
+) -> tuple[Float[Array, " action"], Float[Array, ""]]:
+    """a = tanh(μ + σ ε) and its log-probability, Σ log N(u; μ, σ²) - log(1 - a² + 1e-6), with u before the tanh."""
+    sigma = jnp.exp(log_sigma)
+    action = jnp.tanh(mean + sigma * noise)
+    log_prob = -0.5 * (noise**2 + LOG_2PI) - log_sigma - jnp.log(1 - action**2 + TANH_EPSILON)
+    return action, jnp.sum(log_prob)

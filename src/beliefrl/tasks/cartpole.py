@@ -1,0 +1,70 @@
+"""CartPole with a continuous force: keep a pole upright on a cart (Gymnasium's physics; Appendix B).
+
+    temp = (F + m_p l θ̇² sin θ) / m,   F = 30 a,   m = m_c + m_p
+    θ̈ = (g sin θ - cos θ temp) / (l (4/3 - m_p cos² θ / m))
+    ẍ = temp - m_p l θ̈ cos θ / m,   all four integrated by Euler's explicit step
+"""
+
+import dataclasses
+import math
+from typing import ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Key
+
+from beliefrl.types import Spec
+
+
+class CartPoleState(NamedTuple):
+    x: Float[Array, ""]  # m, 0 in the middle of the track
+    x_dot: Float[Array, ""]  # m/s
+    theta: Float[Array, ""]  # rad, 0 upright
+    theta_dot: Float[Array, ""]  # rad/s
+
+
+@dataclasses.dataclass(frozen=True)
+class CartPole:
+    """Keep a pole upright on a cart that stays on its track: x, ẋ, θ, θ̇; 1 action; 1000 steps."""
+
+    gravity: float = 9.8  # m/s²
+    cart_mass: float = 1.0  # kg
+    pole_mass: float = 0.1  # kg
+    half_length: float = 0.5  # m, from the hinge to the pole's centre of mass
+    force: float = 30.0  # N, at action 1
+    dt: float = 0.02  # s
+    max_x: float = 2.4  # m; beyond it the episode terminates
+    max_theta: float = math.radians(12.0)  # rad; likewise
+    max_steps: int = 1000
+
+    VELOCITIES: ClassVar[tuple[int, ...]] = (1, 3)
+    POSITIONS: ClassVar[tuple[int, ...]] = (0, 2)
+
+    @property
+    def spec(self) -> Spec:
+        return Spec(obs_dim=4, action_dim=1, max_steps=self.max_steps)
+
+    def reset(self, key: Key[Array, ""]) -> tuple[CartPoleState, Float[Array, "4"]]:
+        obs = jax.random.uniform(key, (4,), minval=-0.05, maxval=0.05)
+        return CartPoleState(*obs), obs
+
+    def step(
+        self, state: CartPoleState, action: Float[Array, "1"], key: Key[Array, ""]
+    ) -> tuple[CartPoleState, Float[Array, "4"], Float[Array, ""], Bool[Array, ""]]:
+        x, x_dot, theta, theta_dot = state
+        force = self.force * jnp.clip(action[0], -1.0, 1.0)
+        mass = self.cart_mass + self.pole_mass
+        sin, cos = jnp.sin(theta), jnp.cos(theta)
+
+        temp = (force + self.pole_mass * self.half_length * theta_dot**2 * sin) / mass
+        theta_acc = (self.gravity * sin - cos * temp) / (self.half_length * (4 / 3 - self.pole_mass * cos**2 / mass))
+        x_acc = temp - self.pole_mass * self.half_length * theta_acc * cos / mass
+
+        state = CartPoleState(
+            x + self.dt * x_dot, x_dot + self.dt * x_acc, theta + self.dt * theta_dot, theta_dot + self.dt * theta_acc
+        )
+        terminated = (jnp.abs(state.x) > self.max_x) | (jnp.abs(state.theta) > self.max_theta)
+        return state, jnp.stack(state), jnp.array(1.0), terminated
+
+    def success(self, state: CartPoleState) -> Bool[Array, ""]:
+        return jnp.array(False)

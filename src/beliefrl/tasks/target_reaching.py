@@ -1,0 +1,113 @@
+"""Sequential target reaching: visit red, green and blue in that order, without being told which is next (Section 5.3).
+
+A robot on two wheels in a square field perceives all three targets, and a reward for one step where it reaches
+the one that is due: what it has reached already it must remember.
+
+    forward = speed (a_1 + a_2) / 2 along the heading as it stood;   turn = (a_1 - a_2) / 2 / axle
+    r = -0.1 where the robot would leave the field (it stays),  K / (1 + distance) at the target that is due,  else 0
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from beliefrl.types import Spec
+
+
+class TargetReachingState(NamedTuple):
+    position: Float[Array, "2"]  # in [0, field]²
+    heading: Float[Array, ""]  # rad in [0, 2π)
+    targets: Float[Array, "3 2"]  # red, green, blue
+    reached: Int[Array, ""]  # how many have been reached, 0 to 3
+    reward: Float[Array, ""]  # the last one
+
+
+def wall_distance(position: Float[Array, "2"], heading: Float[Array, ""], field: float) -> Float[Array, ""]:
+    """Distance from a point in [0, field]² to the wall that a ray along `heading` meets."""
+    direction = jnp.stack([jnp.cos(heading), jnp.sin(heading)])
+    room = jnp.where(direction > 0, field - position, position)
+    return jnp.min(room / jnp.maximum(jnp.abs(direction), 1e-6))
+
+
+@dataclasses.dataclass(frozen=True)
+class TargetReaching:
+    """Reach three targets in a hidden order (long-term memory): 12 numbers; 2 actions; 128 steps."""
+
+    field: float = 15.0  # side of the field
+    target_square: float = 4.0  # side of the square in its middle where targets lie
+    min_squared_gap: float = 2.0  # every two targets are further apart than this, squared
+    radius: float = 0.4  # a target is reached within this distance
+    speed: float = 0.8  # distance a step at full speed of both wheels
+    axle: float = 0.5  # distance of the wheels: full opposite speeds turn 1 / axle rad a step
+    rewards: tuple[float, float, float] = (20.0, 50.0, 100.0)  # K of the first, second and third target
+    wall_reward: float = -0.1
+    scale: float = 3.0  # distances d are seen as exp(-d / scale)
+    max_steps: int = 128
+
+    @property
+    def spec(self) -> Spec:
+        return Spec(obs_dim=12, action_dim=2, max_steps=self.max_steps, has_success=True)
+
+    def draw_targets(self, key: Key[Array, ""]) -> Float[Array, "3 2"]:
+        """Three targets uniform in the middle square, redrawn until no two are too close."""
+        low, high = (self.field - self.target_square) / 2, (self.field + self.target_square) / 2
+
+        def draw(key: Key[Array, ""]) -> Float[Array, "3 2"]:
+            return jax.random.uniform(key, (3, 2), minval=low, maxval=high)
+
+        def too_close(carry: tuple[Key[Array, ""], Float[Array, "3 2"]]) -> Bool[Array, ""]:
+            targets = carry[1]
+            gaps = jnp.sum((targets - jnp.roll(targets, 1, axis=0)) ** 2, axis=-1)
+            return jnp.any(gaps <= self.min_squared_gap)
+
+        def redraw(carry: tuple[Key[Array, ""], Float[Array, "3 2"]]) -> tuple[Key[Array, ""], Float[Array, "3 2"]]:
+            key, now = jax.random.split(carry[0])
+            return key, draw(now)
+
+        return jax.lax.while_loop(too_close, redraw, redraw((key, jnp.zeros((3, 2)))))[1]
+
+    def observation(self, state: TargetReachingState) -> Float[Array, "12"]:
+        """Nearness of red, green, blue; of the wall ahead and behind; sin and cos of the three bearings; last reward."""
+        offset = state.targets - state.position
+        distance = jnp.sqrt(jnp.sum(offset**2, axis=-1))
+        bearing = jnp.arctan2(offset[:, 1], offset[:, 0]) - state.heading
+        ahead = wall_distance(state.position, state.heading, self.field)
+        behind = wall_distance(state.position, state.heading + jnp.pi, self.field)
+        near = jnp.exp(-jnp.concatenate([distance, jnp.stack([ahead, behind])]) / self.scale)
+        return jnp.concatenate([near, jnp.sin(bearing), jnp.cos(bearing), state.reward[None]])
+
+    def reset(self, key: Key[Array, ""]) -> tuple[TargetReachingState, Float[Array, "12"]]:
+        key_position, key_heading, key_targets = jax.random.split(key, 3)
+        state = TargetReachingState(
+            position=jax.random.uniform(key_position, (2,), maxval=self.field),
+            heading=jax.random.uniform(key_heading, (), maxval=2 * jnp.pi),
+            targets=self.draw_targets(key_targets),
+            reached=jnp.array(0),
+            reward=jnp.array(0.0),
+        )
+        return state, self.observation(state)
+
+    def step(
+        self, state: TargetReachingState, action: Float[Array, "2"], key: Key[Array, ""]
+    ) -> tuple[TargetReachingState, Float[Array, "12"], Float[Array, ""], Bool[Array, ""]]:
+        left, right = jnp.clip(action, -1.0, 1.0)
+        direction = jnp.stack([jnp.cos(state.heading), jnp.sin(state.heading)])
+        moved = state.position + self.speed * (left + right) / 2 * direction
+        outside = jnp.any((moved < 0) | (moved > self.field))
+        position = jnp.where(outside, state.position, moved)
+        turn = jnp.clip((left - right) / 2 / self.axle, -jnp.pi, jnp.pi)
+
+        squared = jnp.sum((position - state.targets[state.reached]) ** 2)
+        reached = ~outside & (squared < self.radius**2)
+        prize = jnp.array(self.rewards)[state.reached] / (1 + jnp.sqrt(squared))
+        reward = jnp.where(outside, self.wall_reward, jnp.where(reached, prize, 0.0))
+
+        heading = (state.heading + turn) % (2 * jnp.pi)
+        state = TargetReachingState(position, heading, state.targets, state.reached + reached, reward)
+        return state, self.observation(state), reward, self.success(state)
+
+    def success(self, state: TargetReachingState) -> Bool[Array, ""]:
+        return state.reached >= 3

@@ -1,0 +1,64 @@
+"""The words that the whole library shares: a moment, a window of moments, a task's sizes, a user's mistake.
+
+Axis names in shapes, everywhere: `seed` (one training each), `batch` (windows), `time` (moments of a window),
+`obs`, `action`, `belief` (what the controller reads), `d` (recurrent state), `z` (latent variable), `x` (perception).
+"""
+
+from typing import Any, NamedTuple
+
+from jaxtyping import Array, Bool, Float
+
+
+class UserError(Exception):
+    """A mistake that the user can mend. Its message is one sentence: what was wrong, and what to do."""
+
+
+class Spec(NamedTuple):
+    """The sizes of a task, all that an agent learns of it beforehand."""
+
+    obs_dim: int  # numbers in an observation
+    action_dim: int  # degrees of freedom; every action lies in [-1, 1]
+    max_steps: int  # time limit of an episode: it truncates, it does not terminate
+    has_success: bool = False  # whether an episode can succeed, besides its return
+
+
+class Step(NamedTuple):
+    """One moment: what is perceived at t, and what was done just before it.
+
+    Two neighbouring moments are a transition (o_t, a_t, r_t, o_{t+1}) unless the second is_first:
+    a_t is the second's prev_action, r_t its reward. An episode's last observation is a moment too.
+    """
+
+    obs: Float[Array, "*batch obs"]  # o_t
+    reward: Float[Array, "*batch"]  # r_{t-1}, which came with o_t; 0 at the first moment
+    prev_action: Float[Array, "*batch action"]  # a_{t-1} in [-1, 1]; zeros at the first moment
+    is_first: Bool[Array, "*batch"]  # an episode begins here: the memory is empty
+    terminated: Bool[Array, "*batch"]  # o_t is terminal: there is no value beyond it
+
+
+class Moment(NamedTuple):
+    """What the replay keeps of a moment: the step, and the agent's own note of it (any pytree, may be empty)."""
+
+    step: Step
+    note: Any
+
+
+class Window(NamedTuple):
+    """Moments in a row as the replay returns them; is_first is also set at the oldest moment that exists."""
+
+    step: Step  # leaves (batch, time, ...)
+    note: Any
+    exists: Bool[Array, "*batch time"]  # False where the window overhangs what is stored
+
+
+class WindowShape(NamedTuple):
+    """How an agent wants to sample: `burn_in` moments, then `length` transitions (so burn_in + length + 1 moments)."""
+
+    burn_in: int
+    length: int
+
+
+def transitions(window: Window, burn_in: int) -> Bool[Array, "*batch length"]:
+    """Which pairs of neighbours after the burn-in are transitions; (..., time) gives (..., time - burn_in - 1)."""
+    now, after = window.exists[..., burn_in:-1], window.exists[..., burn_in + 1 :]
+    return now & after & ~window.step.is_first[..., burn_in + 1 :]

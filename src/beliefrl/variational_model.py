@@ -1,0 +1,244 @@
+"""The variational recurrent model (VRM): learns to predict perceptions, and so forms a recurrent state d.
+
+Source: Section 4.1, Appendix A.1. With x_t = (o_t, r_{t-1}), a_{t-1} the action before it, and [..] concatenation:
+
+    prior      p(z_t)  = N(μ_p, σ_p)[d_{t-1}, a_{t-1}]
+    posterior  q(z_t)  = N(μ_q, σ_q)[d_{t-1}, a_{t-1}, f_x(x_t)]
+    decoder    p(x_t)  = N(μ_x, σ_x)[d_{t-1}, z_t]
+    state      d_t     = LSTM(d_{t-1}; [f_x(x_t), z_t])
+    ELBO               = E_q log p(x_t) - D_KL(q(z_t) ‖ p(z_t))
+
+Speed decides the form. The posterior's first layers and the LSTM's gates are one layer, `Joint`, kept apart by what it
+multiplies: its products with f_x(x) and a are one batched product before the loop, prior and decoder run after it,
+and the loop keeps the products with d and z. The gradient of a weight inside the loop is one product after it
+(`_loop_backward`); plain differentiation would add up whole matrices at every step.
+
+Departure: one bias for each gate, where PyTorch's LSTM adds up two.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Key
+
+from beliefrl.nets import MLP, gaussian_kl, gaussian_log_prob, lstm_state
+
+SIGMA_X_MIN = 1e-3
+
+
+class LSTMState(NamedTuple):
+    """What an LSTM remembers; zeros where an episode begins."""
+
+    d: Float[Array, "*batch d"]  # its output, the recurrent state of the paper
+    c: Float[Array, "*batch d"]  # its cell
+
+
+class Gaussian(NamedTuple):
+    mean: Float[Array, "*shape"]
+    sigma: Float[Array, "*shape"]
+
+
+class Inferred(NamedTuple):
+    """An unroll of the inference model, leaves (time, batch, ...)."""
+
+    posterior: Gaussian  # of z_t
+    z: Float[Array, "time batch z"]
+    before: Float[Array, "time batch d"]  # d_{t-1}, zeros where an episode begins
+    state: LSTMState  # d_t and its cell
+
+
+class Joint(eqx.Module):
+    """The first layers of μ_q and σ_q and the four gates, side by side: (hidden, hidden, 4 d) = joint outputs.
+
+    Stored input by output, as the loop multiplies them; what an output does not read has no weights here.
+    """
+
+    by_d: Float[Array, "d joint"]
+    by_features: Float[Array, "hidden joint"]
+    by_action: Float[Array, "action 2*hidden"]  # the posterior alone
+    by_z: Float[Array, "z 4*d"]  # the gates alone
+    bias: Float[Array, " joint"]
+
+    def __init__(self, action: int, d: int, z: int, hidden: int, key: Key[Array, ""]):
+        posterior, gates = (d + action + hidden) ** -0.5, d**-0.5  # PyTorch's bounds for a linear layer and an LSTM
+        bound = jnp.concatenate([jnp.full(2 * hidden, posterior), jnp.full(4 * d, gates)])
+
+        def uniform(key, rows, bound):
+            return jax.random.uniform(key, (rows, bound.size), minval=-1.0) * bound[None]
+
+        keys = jax.random.split(key, 5)
+        self.by_d = uniform(keys[0], d, bound)
+        self.by_features = uniform(keys[1], hidden, bound)
+        self.by_action = uniform(keys[2], action, bound[: 2 * hidden])
+        self.by_z = uniform(keys[3], z, bound[2 * hidden :])
+        self.bias = uniform(keys[4], 1, bound)[0]
+
+    def given(
+        self, features: Float[Array, "time batch hidden"], prev_action: Float[Array, "time batch action"]
+    ) -> Float[Array, "time batch joint"]:
+        """What the layer gets from f_x(x_t) and a_{t-1}."""
+        posterior = prev_action @ self.by_action
+        gates = jnp.zeros((*posterior.shape[:-1], self.by_z.shape[1]))
+        everything = features @ self.by_features + jnp.concatenate([posterior, gates], axis=-1)
+        return everything + jnp.broadcast_to(self.bias, everything.shape)
+
+
+class VRM(eqx.Module):
+    """The weights of one variational recurrent model."""
+
+    features: MLP  # f_x
+    joint: Joint
+    posterior_mean: eqx.nn.Linear  # last layers of μ_q and σ_q
+    posterior_sigma: eqx.nn.Linear
+    prior_mean: MLP
+    prior_sigma: MLP
+    decoder_mean: MLP
+    decoder_sigma: MLP
+
+    def __init__(self, x: int, action: int, d: int, z: int, hidden: int, key: Key[Array, ""]):
+        """Widths: perception (observation and reward), action, d, z, and every hidden layer."""
+        keys = iter(jax.random.split(key, 8))
+
+        def net(*sizes: int) -> MLP:
+            return MLP(sizes, jnp.tanh, next(keys))
+
+        self.features = net(x, hidden, hidden)
+        self.joint = Joint(action, d, z, hidden, next(keys))
+        self.posterior_mean = eqx.nn.Linear(hidden, z, key=next(keys))
+        self.posterior_sigma = eqx.nn.Linear(hidden, z, key=next(keys))
+        self.prior_mean = net(d + action, hidden, z)
+        self.prior_sigma = net(d + action, hidden, z)
+        self.decoder_mean = net(d + z, hidden, hidden, x)
+        self.decoder_sigma = net(d + z, hidden, hidden, x)
+
+    def start(self, batch: int) -> LSTMState:
+        """The state in which episodes begin."""
+        zeros = jnp.zeros((batch, self.joint.by_d.shape[0]))
+        return LSTMState(zeros, zeros)
+
+    def prior(self, before: Float[Array, " d"], prev_action: Float[Array, " action"]) -> Gaussian:
+        """p(z_t | d_{t-1}, a_{t-1})."""
+        known = jnp.concatenate([before, prev_action])
+        return Gaussian(self.prior_mean(known), jax.nn.softplus(self.prior_sigma(known)))
+
+    def decode(self, before: Float[Array, " d"], z: Float[Array, " z"]) -> Gaussian:
+        """p(x_t | z_t, d_{t-1})."""
+        known = jnp.concatenate([before, z])
+        return Gaussian(self.decoder_mean(known), jax.nn.softplus(self.decoder_sigma(known)) + SIGMA_X_MIN)
+
+    def infer(
+        self,
+        start: LSTMState,
+        x: Float[Array, "time batch x"],
+        prev_action: Float[Array, "time batch action"],
+        is_first: Bool[Array, "time batch"],
+        noise: Float[Array, "time batch z"],
+    ) -> Inferred:
+        """Unroll the inference model with z_t = μ_q + σ_q · noise_t, from `start` and from zero wherever is_first."""
+        given = self.joint.given(jax.vmap(jax.vmap(self.features))(x), prev_action)
+        weights = Loop(self.joint.by_d, self.joint.by_z, self.posterior_mean, self.posterior_sigma)
+        return _loop(weights, start, given, is_first, noise)
+
+
+class Terms(NamedTuple):
+    """The two terms of the ELBO at every step, each summed or averaged over its dimensions."""
+
+    kl: Float[Array, "time batch"]  # D_KL(q ‖ p)
+    log_likelihood: Float[Array, "time batch"]  # log p(x)
+
+
+def elbo_terms(
+    vrm: VRM,
+    inferred: Inferred,
+    x: Float[Array, "time batch x"],
+    prev_action: Float[Array, "time batch action"],
+    scaling: str = "mean",
+    prior_noise: Float[Array, "time batch z"] | None = None,
+) -> Terms:
+    """Both terms of the ELBO of an unroll.
+
+    `scaling` "mean" averages over the dimensions of z and x as the authors' code does (their learning rate was tuned
+    on it), "sum" is the paper's formula. With `prior_noise` z is drawn from the prior for decoding, as in their code.
+    """
+    prior = jax.vmap(jax.vmap(vrm.prior))(inferred.before, prev_action)
+    z = inferred.z if prior_noise is None else prior.mean + prior.sigma * prior_noise
+    decoded = jax.vmap(jax.vmap(vrm.decode))(inferred.before, z)
+    reduce = {"mean": jnp.mean, "sum": jnp.sum}[scaling]
+    kl = reduce(gaussian_kl(*inferred.posterior, *prior), axis=-1)
+    return Terms(kl, reduce(gaussian_log_prob(x, *decoded), axis=-1))
+
+
+class Loop(NamedTuple):
+    """The weights that stay inside the loop."""
+
+    by_d: Float[Array, "d joint"]
+    by_z: Float[Array, "z 4*d"]
+    mean: eqx.nn.Linear
+    sigma: eqx.nn.Linear
+
+
+class Hidden(NamedTuple):
+    """What the gradient of the loop's weights needs besides what `Inferred` holds, leaves (time, batch, ...)."""
+
+    mean: Float[Array, "time batch hidden"]
+    sigma: Float[Array, "time batch hidden"]
+
+
+def _cell(weights, state, given, zero, is_first, noise):
+    """One step. `zero` is added to the outputs of the posterior's last layers: its cotangent is theirs."""
+    before = jax.tree.map(lambda leaf: jnp.where(is_first[:, None], 0.0, leaf), state)
+    pre = given + before.d @ weights.by_d
+    hidden = weights.mean.in_features
+    first = jnp.tanh(pre[:, : 2 * hidden])
+    hidden_mean, hidden_sigma = first[:, :hidden], first[:, hidden:]
+    mean = jax.vmap(weights.mean)(hidden_mean) + zero.mean
+    sigma = jax.nn.softplus(jax.vmap(weights.sigma)(hidden_sigma) + zero.sigma)
+    z = mean + sigma * noise
+    state = LSTMState(*lstm_state(pre[:, 2 * hidden :] + z @ weights.by_z, before.c))
+    return state, (Inferred(Gaussian(mean, sigma), z, before.d, state), Hidden(hidden_mean, hidden_sigma))
+
+
+def _scan(weights, start, given, zero, is_first, noise):
+    def step(state, inputs):
+        return _cell(weights, state, *inputs)
+
+    return jax.lax.scan(step, start, (given, zero, is_first, noise))[1]
+
+
+@jax.custom_vjp
+def _loop(weights, start, given, is_first, noise) -> Inferred:
+    return _scan(weights, start, given, Gaussian(jnp.zeros_like(noise), jnp.zeros_like(noise)), is_first, noise)[0]
+
+
+def _loop_forward(weights, start, given, is_first, noise):
+    zero = Gaussian(jnp.zeros_like(noise), jnp.zeros_like(noise))
+    (inferred, hidden), pullback = jax.vjp(
+        lambda start, given, zero: _scan(weights, start, given, zero, is_first, noise), start, given, zero
+    )
+    return inferred, (weights, inferred, hidden, pullback)
+
+
+def _loop_backward(saved, cotangent):
+    weights, inferred, hidden, pullback = saved
+    by_start, by_given, by_last = pullback((cotangent, jax.tree.map(jnp.zeros_like, hidden)))
+
+    def product(left, right):
+        return jnp.einsum("tbm,tbn->mn", left, right)
+
+    def layer(linear, inputs, outputs):
+        gradient = (product(outputs, inputs), jnp.sum(outputs, (0, 1)))
+        return eqx.tree_at(lambda layer: (layer.weight, layer.bias), linear, gradient)
+
+    by_gates = by_given[..., -weights.by_z.shape[1] :]
+    by_weights = Loop(
+        product(inferred.before, by_given),
+        product(inferred.z, by_gates),
+        layer(weights.mean, hidden.mean, by_last.mean),
+        layer(weights.sigma, hidden.sigma, by_last.sigma),
+    )
+    return by_weights, by_start, by_given, None, None
+
+
+_loop.defvjp(_loop_forward, _loop_backward)
