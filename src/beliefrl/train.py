@@ -1,189 +1,202 @@
-"""Algorithm 1 of the paper: explore, pre-train, then learn in cycles; compiled, and for many seeds in one program.
+"""Training from the first step to the last, on the host: which phase is called when, and what is logged.
 
-    explore    step_start_rl environment steps with the untrained policy
-    pretrain   updates on what they recorded; then the actor and the replay perceive it again
-    learn      cycles: the agent prepares one (VRM: updates its model), then acts, records and updates at every step
-
-The step counter stays outside what is mapped over seeds, and each phase is a compiled function of its own, called
-for a stretch of steps whose number is an argument: one compilation serves all stretches, and no result depends on
-how the training is cut into them. Random keys are derived from the seed's key and the running number of the step.
+The loop is Python over compiled stretches (`phases`); logs, progress and Ctrl-C live here, nothing is called back
+from inside a compiled function. `stages` yields what happens, `train` records it in a run's folder.
 """
 
+import dataclasses
+import os
 from collections.abc import Callable, Iterator
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key
+import numpy as np
 
-from beliefrl import replay as ring
-from beliefrl import rollout
+from beliefrl import agents, phases, runs, tasks
 from beliefrl.agents import Agent
-from beliefrl.replay import Replay
-from beliefrl.rollout import Actor, Episode
+from beliefrl.analysis.curves import draw_curve
+from beliefrl.evaluation import MODES, summary
+from beliefrl.phases import Metrics
+from beliefrl.rollout import Episode
+from beliefrl.runs import Recorder, Run
 from beliefrl.tasks import Task
 from beliefrl.types import UserError
 
-Metrics = dict[str, Float[Array, "..."]]
-STRETCH = 100  # environment steps between two entries of the log, at most
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """How long, how often and how a training is evaluated."""
+
+    steps: int = 20_000
+    """Environment steps of each seed, rounded up to whole cycles of the agent."""
+    seeds: int = 1
+    """How many seeds are trained, side by side in one program."""
+    seed: int = 0
+    """Number of the first seed; the others follow it."""
+    eval_every: int = 2_000
+    """Environment steps between two evaluations (Appendix B)."""
+    eval_episodes: int = 5
+    """Episodes of each evaluation, with sampled actions and again with mode actions."""
+    replay_capacity: int = 1_000_000
+    """Most moments that a seed's replay keeps; the oldest make room."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible values with a UserError."""
+        for name in ("steps", "seeds", "eval_every", "eval_episodes", "replay_capacity"):
+            if getattr(self, name) < 1:
+                raise UserError(f"{name}={getattr(self, name)} is impossible: it must be at least 1.")
+        if not 0 <= self.seed < 2**31:
+            raise UserError(f"seed={self.seed} is impossible: it must be from 0 to {2**31 - 1}.")
 
 
-class Seed(NamedTuple):
-    """All of one training. Mapped over seeds, every leaf has a leading axis `seed`."""
+class Event(NamedTuple):
+    """What has just happened in a training; fields beyond the first three only where they apply."""
 
-    state: Any  # the agent's
-    actor: Actor
-    replay: Replay
-    key: Key[Array, ""]
-
-
-class Stretch(NamedTuple):
-    """What a stretch of steps tells, of one seed."""
-
-    metrics: Metrics  # means over its updates
-    episodes: Episode  # leaves (STRETCH,): one entry a step, done only where an episode ended
+    doing: str  # what comes next, in words
+    step: int  # environment steps of each seed so far
+    metrics: Metrics = {}  # leaves (seed,): means over the last stretch
+    episodes: Episode | None = None  # leaves (seed, stretch)
+    evaluation: Episode | None = None  # leaves (seed, mode, episodes)
+    states: Any = None  # the agents, with an evaluation
+    part: tuple[int, int] | None = None  # of the pre-training: updates done, of how many
 
 
-def begin(agent: Agent, task: Task, capacity: int, key: Key[Array, ""]) -> Seed:
-    """A seed before its first step; `capacity` moments fit its replay."""
-    key_state, key_actor, key = jax.random.split(key, 3)
-    actor = rollout.begin(agent, task, key_actor)
-    replay = ring.init(rollout.moment(agent, actor), capacity)
-    return Seed(agent.init(key_state, task.spec), actor, replay, key)
+def stages(agent: Agent, task: Task, options: Options) -> Iterator[Event]:
+    """Train; yields an Event before whatever takes long and after whatever gave something to tell."""
+    start = min(agent.step_start_rl, options.steps)
+    capacity = min(options.replay_capacity, 2 * options.steps)  # a moment a step, and one more where an episode ends
+    if options.steps > start and capacity < min(2 * start, agent.window.length + 1):
+        raise UserError(f"replay_capacity={options.replay_capacity} is too small for step_start_rl={start}: raise it.")
+    program = phases.compile_program(agent, task, capacity, options.eval_episodes)
+    keys = jax.vmap(jax.random.key)(np.arange(options.seed, options.seed + options.seeds))
+    stretch = phases.stretch_length(agent)
+
+    yield Event("compiling the exploration", 0)
+    seeds, step, evaluated = program.begin(keys), 0, 0
+    while step < start:
+        steps = min(stretch, start - step, _until(step, options.eval_every))
+        seeds, told = program.explore(seeds, step, steps)
+        step += steps
+        yield Event("exploring", step, episodes=told.episodes)
+        if step % options.eval_every == 0:
+            yield from _evaluation(program, seeds, evaluated := step)
+
+    if step < options.steps and agent.pretrain_updates:
+        yield Event("compiling the pre-training", step)
+        for first in range(0, agent.pretrain_updates, stretch):
+            updates = min(stretch, agent.pretrain_updates - first)
+            seeds, metrics = program.pretrain(seeds, first, updates)
+            part = (first + updates, agent.pretrain_updates)
+            yield Event("pre-training", step, {f"pretrain_{name}": mean for name, mean in metrics.items()}, part=part)
+        seeds = program.relive(seeds)
+
+    if step < options.steps:
+        yield Event("compiling the learning", step)
+    while step < options.steps:
+        until = min(options.steps - step, _until(step, options.eval_every))
+        cycles = min(-(-until // agent.cycle), stretch // agent.cycle)
+        seeds, told = program.learn(seeds, step, cycles)
+        before, step = step, step + cycles * agent.cycle
+        yield Event("learning", step, told.metrics, told.episodes)
+        if step // options.eval_every > before // options.eval_every:
+            yield from _evaluation(program, seeds, evaluated := step)
+    if evaluated < step:
+        yield from _evaluation(program, seeds, step)
 
 
-def _no_episodes() -> Episode:
-    none = jnp.zeros(STRETCH, bool)
-    return Episode(none, jnp.zeros(STRETCH), jnp.zeros(STRETCH, int), none)
+def _until(step: int, every: int) -> int:
+    """Steps to the next multiple of `every`."""
+    return every - step % every
 
 
-def _write(log: Episode, index: Int[Array, ""], episode: Episode) -> Episode:
-    return jax.tree.map(lambda column, entry: column.at[index].set(entry), log, episode)
+def _evaluation(program: phases.Program, seeds: phases.Seed, step: int) -> Iterator[Event]:
+    yield Event("evaluating", step)
+    keys = jax.vmap(lambda key: jax.random.fold_in(jax.random.fold_in(key, phases.EVALUATE), step))(seeds.key)
+    result = program.evaluate(seeds.state, keys)
+    yield Event("learning", step, evaluation=result, states=seeds.state)
 
 
-def _step_key(seed: Seed, step: Int[Array, ""], purpose: int) -> Key[Array, ""]:
-    return jax.random.fold_in(jax.random.fold_in(seed.key, purpose), step)
+def train(
+    agent: Agent | str,
+    task: Task | str,
+    out: str | os.PathLike[str] | None = None,
+    report: Callable[[Event], None] | None = None,
+    **options: Any,
+) -> Run:
+    """Train an agent on a task and record it in a folder.
+
+    Args:
+        agent: an agent, or the name of one with its default hyperparameters.
+        task: a task, or the name of one.
+        out: the run's folder, which must not exist; None is runs/AGENT-TASK-1, or the next free number.
+        report: called with every Event as it happens, for progress.
+        options: the fields of `Options`: steps, seeds, seed, eval_every, eval_episodes, replay_capacity.
+
+    Returns:
+        The finished run: its results, its log, its files (`runs`).
+
+    Raises:
+        UserError: an unknown name or option, an impossible value, or `out` exists.
+    """
+    agent = agents.make(agent) if isinstance(agent, str) else agent
+    task = tasks.make(task) if isinstance(task, str) else task
+    known = [field.name for field in dataclasses.fields(Options)]
+    for name in options:
+        if name not in known:
+            raise UserError(f"Training has no option {name!r}: it has {', '.join(known)}.")
+    chosen = Options(**options)
+    config = {
+        "agent": agents.name_of(agent),
+        "hyperparameters": dataclasses.asdict(agent),  # pyright: ignore[reportArgumentType]
+        **tasks.describe(task),
+        "options": dataclasses.asdict(chosen),
+        **runs.provenance(),
+    }
+    recorder = Recorder(out or runs.free_folder(f"{config['agent']}-{config['task']}"), config)
+    results = None
+    try:
+        for event in stages(agent, task, chosen):
+            results = _record(recorder, event, task.spec.has_success) or results
+            if report is not None:
+                report(event)
+    finally:
+        recorder.close()
+    recorder.finish(results or {})
+    draw_curve(recorder)
+    return recorder
 
 
-ACT, UPDATE, SAMPLE, CYCLE, PRETRAIN, RELIVE, EVALUATE = range(7)  # purposes of keys: no two share one
+def _record(recorder: Recorder, event: Event, has_success: bool) -> dict[str, Any] | None:
+    """Log what an event tells of every seed; returns the summary of an evaluation."""
+    metrics = {name: np.asarray(values) for name, values in event.metrics.items()}
+    for index, seed in enumerate(recorder.seeds):
+        if metrics and event.part:
+            recorder.log(seed, "pretrain", event.part[0], {k: float(v[index]) for k, v in metrics.items()})
+        elif metrics:
+            recorder.log(seed, "update", event.step, {k: float(v[index]) for k, v in metrics.items()})
+        if event.episodes is not None:
+            episodes = jax.tree.map(lambda leaf, index=index: np.asarray(leaf[index]), event.episodes)
+            for end in np.flatnonzero(episodes.done):
+                recorder.log(seed, "episode", event.step, _episode(episodes, end, has_success))
+        if event.evaluation is not None:
+            result = jax.tree.map(lambda leaf, index=index: np.asarray(leaf[index]), event.evaluation)
+            recorder.log(seed, "evaluation", event.step, _evaluated(result, has_success))
+    if event.evaluation is None:
+        return None
+    recorder.flush()
+    recorder.save(event.states)
+    return {"step": event.step} | summary(event.evaluation, has_success)
 
 
-def explore(agent: Agent, task: Task, seed: Seed, first: Int[Array, ""], steps: Int[Array, ""]) -> tuple[Seed, Stretch]:
-    """Environment steps `first` to `first + steps` without updates; at most STRETCH of them."""
-
-    def step(i, carry):
-        seed, log = carry
-        key = _step_key(seed, first + i, ACT)
-        actor, replay, episode = rollout.advance(agent, task, seed.state, seed.actor, seed.replay, key)
-        return seed._replace(actor=actor, replay=replay), _write(log, i, episode)
-
-    seed, log = jax.lax.fori_loop(0, steps, step, (seed, _no_episodes()))
-    return seed, Stretch({}, log)
+def _episode(episodes: Episode, end: Any, has_success: bool) -> dict[str, Any]:
+    success = {"success": bool(episodes.success[end])} if has_success else {}
+    return {"return": float(episodes.total[end]), "length": int(episodes.length[end])} | success
 
 
-def _sum_metrics(shapes: Metrics) -> Metrics:
-    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-
-
-def pretrain(agent: Agent, seed: Seed, first: Int[Array, ""], updates: Int[Array, ""]) -> tuple[Seed, Metrics]:
-    """Updates `first` to `first + updates` of the pre-training; metrics are their means."""
-
-    def update(seed: Seed, number: Int[Array, ""]) -> tuple[Seed, Metrics]:
-        key_sample, key = jax.random.split(_step_key(seed, number, PRETRAIN))
-        windows = ring.sample(seed.replay, key_sample, agent.pretrain_windows, agent.window)
-        state, metrics = agent.pretrain(seed.state, windows, key)
-        return seed._replace(state=state), metrics
-
-    def step(i, carry):
-        seed, totals = carry
-        seed, metrics = update(seed, first + i)
-        return seed, jax.tree.map(jnp.add, totals, metrics)
-
-    totals = _sum_metrics(jax.eval_shape(update, seed, first)[1])
-    seed, totals = jax.lax.fori_loop(0, updates, step, (seed, totals))
-    return seed, jax.tree.map(lambda total: total / jnp.maximum(updates, 1), totals)
-
-
-def relive(agent: Agent, seed: Seed) -> Seed:
-    """Perceive again, with the pre-trained networks, everything recorded so far (at most 2 moments a step)."""
-    length = min(2 * agent.step_start_rl, ring.capacity(seed.replay))
-    key = jax.random.fold_in(seed.key, RELIVE)
-    actor, replay = rollout.relive(agent, seed.state, seed.actor, seed.replay, key, length)
-    return seed._replace(actor=actor, replay=replay)
-
-
-def learn(agent: Agent, task: Task, seed: Seed, first: Int[Array, ""], cycles: Int[Array, ""]) -> tuple[Seed, Stretch]:
-    """`cycles` cycles of learning from environment step `first` on; at most STRETCH steps in all."""
-    shapes = jax.eval_shape(partial(_cycle, agent, task), seed, _no_episodes(), first, first)[2]
-
-    def step(i, carry):
-        seed, log, totals = carry
-        seed, log, metrics = _cycle(agent, task, seed, log, first + i * agent.cycle, i * agent.cycle)
-        return seed, log, jax.tree.map(jnp.add, totals, metrics)
-
-    seed, log, totals = jax.lax.fori_loop(0, cycles, step, (seed, _no_episodes(), _sum_metrics(shapes)))
-    return seed, Stretch(jax.tree.map(lambda total: total / jnp.maximum(cycles, 1), totals), log)
-
-
-def _cycle(
-    agent: Agent, task: Task, seed: Seed, log: Episode, first: Int[Array, ""], index: Int[Array, ""]
-) -> tuple[Seed, Episode, Metrics]:
-    """One cycle, from environment step `first` on, whose entries in the log begin at `index`."""
-    windows = ring.sample(seed.replay, _step_key(seed, first, SAMPLE), agent.cycle_windows, agent.window)
-    # The windows are read before the cycle's moments are added: without the barrier XLA copies the whole ring.
-    windows, replay = jax.lax.optimization_barrier((windows, seed.replay))
-    state, batches, model_metrics = agent.begin_cycle(seed.state, windows, _step_key(seed, first, CYCLE))
-    seed = seed._replace(state=state, replay=replay)
-    interval = agent.train_interval_rl
-
-    def act(carry, offset):
-        seed, log = carry
-        key = _step_key(seed, first + offset, ACT)
-        actor, replay, episode = rollout.advance(agent, task, seed.state, seed.actor, seed.replay, key)
-        return (seed._replace(actor=actor, replay=replay), _write(log, index + offset, episode)), None
-
-    def update(carry, inputs):
-        number, batch = inputs
-        carry, _ = jax.lax.scan(act, carry, number * interval + jnp.arange(interval))
-        seed, log = carry
-        state, metrics = agent.update(seed.state, batch, _step_key(seed, first + number, UPDATE))
-        return (seed._replace(state=state), log), metrics
-
-    updates = jnp.arange(agent.cycle // interval)
-    (seed, log), metrics = jax.lax.scan(update, (seed, log), (updates, batches))
-    return seed, log, model_metrics | jax.tree.map(jnp.mean, metrics)
-
-
-def evaluate(agent: Agent, task: Task, state: Any, key: Key[Array, ""], episodes: int) -> Episode:
-    """Episodes with sampled actions, then as many with mode actions; leaves (2, episodes)."""
-    sampled: Bool[Array, " 2*episodes"] = jnp.arange(2 * episodes) < episodes
-    result = rollout.evaluate(agent, task, state, key, sampled)
-    return jax.tree.map(lambda leaf: leaf.reshape(2, episodes), result)
-
-
-class Program(NamedTuple):
-    """The phases of training, compiled for many seeds: leaves of every Seed have a leading axis `seed`."""
-
-    begin: Callable[..., Seed]  # keys (seed,)
-    explore: Callable[..., tuple[Seed, Stretch]]  # seeds, first, steps
-    pretrain: Callable[..., tuple[Seed, Metrics]]  # seeds, first, updates
-    relive: Callable[..., Seed]  # seeds
-    learn: Callable[..., tuple[Seed, Stretch]]  # seeds, first, cycles
-    evaluate: Callable[..., Episode]  # states (seed, ...), keys (seed,); leaves (seed, 2, episodes)
-
-
-def compile_program(agent: Agent, task: Task, capacity: int, episodes: int) -> Program:
-    """The phases as compiled functions. Seeds given to one are used up: their memory is taken over."""
-
-    def mapped(function: Callable[..., Any], numbers: int) -> Callable[..., Any]:
-        return jax.jit(jax.vmap(function, in_axes=(0, *[None] * numbers)), donate_argnums=0)
-
-    return Program(
-        begin=jax.jit(jax.vmap(partial(begin, agent, task, capacity))),
-        explore=mapped(partial(explore, agent, task), 2),
-        pretrain=mapped(partial(pretrain, agent), 2),
-        relive=mapped(partial(relive, agent), 0),
-        learn=mapped(partial(learn, agent, task), 2),
-        evaluate=jax.jit(jax.vmap(partial(evaluate, agent, task, episodes=episodes))),
-    )
+def _evaluated(result: Episode, has_success: bool) -> dict[str, Any]:
+    values: dict[str, Any] = {}
+    for index, mode in enumerate(MODES):
+        values[mode] = [float(total) for total in result.total[index]]
+        if has_success:
+            values[f"{mode}_success"] = [bool(success) for success in result.success[index]]
+    return values

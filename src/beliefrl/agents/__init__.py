@@ -113,5 +113,8 @@ def make(name: str, **hyperparameters: Any) -> Agent:
 
 
 def name_of(agent: Agent) -> str:
-    """The name under which `make` finds an agent's class."""
-    return next(name for name, known in AGENTS.items() if type(agent) is known)
+    """The name under which `make` finds an agent's class; module:Class for one that is not in this library."""
+    for name, known in AGENTS.items():
+        if type(agent) is known:
+            return name
+    return f"{type(agent).__module__}:{type(agent).__qualname__}"

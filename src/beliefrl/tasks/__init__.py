@@ -3,7 +3,7 @@
 import dataclasses
 import difflib
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
@@ -14,6 +14,7 @@ from beliefrl.tasks.target_reaching import TargetReaching
 from beliefrl.types import Spec, UserError
 
 
+@runtime_checkable
 class Task(Protocol):
     """A frozen dataclass of physical constants with pure methods; no time limit and no reset of its own.
 
@@ -126,3 +127,16 @@ def make(name: str, **constants: Any) -> Task:
     if not mask:
         return task
     return observe(task, task.VELOCITIES if mask == "-v" else task.POSITIONS)
+
+
+def describe(task: Task) -> dict[str, Any]:
+    """{"task": the name for `make`, "constants": what it was made with}.
+
+    A task that `make` cannot make is named module:Class, and has no constants.
+    """
+    base, indices = (task.task, task.indices) if isinstance(task, Observed) else (task, None)
+    masks = {None: "", getattr(base, "VELOCITIES", ()): "-v", getattr(base, "POSITIONS", ()): "-p"}
+    for name, known in TASKS.items():
+        if type(base) is known and indices in masks:
+            return {"task": name + masks[indices], "constants": dataclasses.asdict(base)}
+    return {"task": f"{type(task).__module__}:{type(task).__qualname__}", "constants": {}}

@@ -1,0 +1,43 @@
+"""BeliefRL: reinforcement learning for agents that do not see the whole state.
+
+    import beliefrl
+
+    agent = beliefrl.make_agent("vrm")
+    task = beliefrl.make_task("pendulum-v")
+    run = beliefrl.train(agent, task, steps=15_000, seeds=3, out="runs/first")
+    print(beliefrl.evaluate(run, episodes=20))
+"""
+
+from importlib.metadata import version
+
+from beliefrl.agents import Agent
+from beliefrl.agents import make as make_agent
+from beliefrl.analysis.curves import draw_curve
+from beliefrl.evaluation import evaluate
+from beliefrl.runs import Run
+from beliefrl.tasks import Task, observe
+from beliefrl.tasks import make as make_task
+from beliefrl.train import Event, Options, train
+from beliefrl.types import Moment, Spec, Step, UserError, Window, WindowShape
+
+__version__ = version("beliefrl")
+
+__all__ = [
+    "Agent",
+    "Event",
+    "Moment",
+    "Options",
+    "Run",
+    "Spec",
+    "Step",
+    "Task",
+    "UserError",
+    "Window",
+    "WindowShape",
+    "draw_curve",
+    "evaluate",
+    "make_agent",
+    "make_task",
+    "observe",
+    "train",
+]

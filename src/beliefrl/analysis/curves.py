@@ -1,0 +1,60 @@
+"""The learning curve of a run: mean and standard error over seeds (Figures 4 and 6)."""
+
+import pathlib
+
+import numpy as np
+
+from beliefrl.runs import Run
+
+COLOURS = {"sampled": "#1f6f8b", "mode": "#c8553d"}
+
+
+def evaluations(run: Run, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Steps (evaluation,) and each seed's mean (seed, evaluation) of an evaluation's entry, as far as all seeds have it."""
+    seeds = [{row["step"]: float(np.mean(row[name])) for row in run.rows(seed, "evaluation")} for seed in run.seeds]
+    steps = sorted(set.intersection(*map(set, seeds)))
+    return np.array(steps), np.array([[seed[step] for step in steps] for seed in seeds]).reshape(len(seeds), -1)
+
+
+def standard_error(seeds: np.ndarray) -> np.ndarray:
+    """S.E.M. over the first axis; zeros where there is only one seed."""
+    if len(seeds) < 2:
+        return np.zeros(seeds.shape[1:])
+    return seeds.std(axis=0, ddof=1) / np.sqrt(len(seeds))
+
+
+def draw_curve(run: Run, path: pathlib.Path | str | None = None) -> pathlib.Path:
+    """Draw a run's evaluations, with a second panel for success where its task has one; returns the picture's path.
+
+    `path` is the run's curve.png if not given. One thin line a seed, a thick one and a band for mean and S.E.M.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # no display, no global state
+    from matplotlib.figure import Figure
+
+    path = pathlib.Path(path or run.folder / "curve.png")
+    rows = list(run.rows(run.seeds[0], "evaluation"))
+    panels = [("return", "")]
+    if rows and "sampled_success" in rows[0]:
+        panels.append(("success rate", "_success"))
+
+    figure = Figure(figsize=(5.6 * len(panels), 3.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    for axis, (label, suffix) in zip(axes, panels, strict=True):
+        for mode, colour in COLOURS.items():
+            steps, seeds = evaluations(run, mode + suffix)
+            mean, error = seeds.mean(axis=0), standard_error(seeds)
+            for seed in seeds if len(seeds) > 1 else []:
+                axis.plot(steps, seed, color=colour, linewidth=0.6, alpha=0.4)
+            axis.plot(steps, mean, color=colour, linewidth=2, label=f"{mode} actions", marker="o", markersize=3)
+            axis.fill_between(steps, mean - error, mean + error, color=colour, alpha=0.2, linewidth=0)
+        axis.set_xlabel("environment steps")
+        axis.set_ylabel(label)
+        axis.grid(alpha=0.25)
+        axis.spines[["top", "right"]].set_visible(False)
+    count = len(run.seeds)
+    spread = f"mean and S.E.M. of {count} seeds" if count > 1 else "1 seed"
+    axes[0].set_title(f"{run.config['agent']} on {run.config['task']}, {spread}", loc="left", fontsize=10)
+    axes[0].legend(frameon=False, loc="best", fontsize=9)
+    figure.savefig(path, dpi=150)
+    return path

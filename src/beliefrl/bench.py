@@ -1,0 +1,187 @@
+"""What a step costs: milliseconds per environment step at any sizes, in parts, beside what the machine can do.
+
+The task is made up (noise as observations), so only its sizes count. `ms_per_step` is the training loop itself, with
+the pre-training spread over the 100,000 steps of the paper's scalability table; the parts are timed one by one and
+need not add up to it exactly. Timings are medians.
+"""
+
+import dataclasses
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Key
+
+from beliefrl import phases
+from beliefrl import replay as ring
+from beliefrl.agents import Agent
+from beliefrl.types import Spec, UserError
+
+PAPER_STEPS = 100_000  # of the wall-clock times in the paper's scalability table
+REPEATS = 9
+
+
+@dataclasses.dataclass(frozen=True)
+class Noise:
+    """A task of given sizes with nothing in it."""
+
+    obs_dim: int
+    action_dim: int
+
+    def __post_init__(self) -> None:
+        if self.obs_dim < 1 or self.action_dim < 1:
+            raise UserError(f"obs={self.obs_dim}, actions={self.action_dim} is impossible: both must be at least 1.")
+
+    @property
+    def spec(self) -> Spec:
+        return Spec(self.obs_dim, self.action_dim, max_steps=1000)
+
+    def reset(self, key: Key[Array, ""]) -> tuple[tuple[()], Float[Array, " obs"]]:
+        return (), jax.random.normal(key, (self.obs_dim,))
+
+    def step(
+        self, state: tuple[()], action: Float[Array, " action"], key: Key[Array, ""]
+    ) -> tuple[tuple[()], Float[Array, " obs"], Float[Array, ""], Bool[Array, ""]]:
+        return (), jax.random.normal(key, (self.obs_dim,)), jnp.mean(action), jnp.array(False)
+
+    def success(self, state: tuple[()]) -> Bool[Array, ""]:
+        return jnp.array(False)
+
+
+def median_seconds(call: Callable[[], Any], repeats: int = REPEATS) -> float:
+    """The median time of a call, once it has run; waits for its result."""
+    jax.block_until_ready(call())
+    times = []
+    for _ in range(repeats):
+        before = time.perf_counter()
+        jax.block_until_ready(call())
+        times.append(time.perf_counter() - before)
+    return statistics.median(times)
+
+
+def matmul_gflops(size: int = 2048) -> float:
+    """The machine's measured rate of a large float32 matrix product, in GFLOP/s."""
+    matrix = jax.random.normal(jax.random.key(0), (size, size))
+    product = jax.jit(lambda a: a @ a)
+    return 2 * size**3 / median_seconds(lambda: product(matrix)) / 1e9
+
+
+def parameters(tree: Any) -> int:
+    """How many numbers the networks in an agent's state hold, optimisers apart."""
+    networks = [value for name, value in tree._asdict().items() if not name.endswith("optimiser")]
+    return sum(leaf.size for leaf in jax.tree.leaves(networks))
+
+
+class _Timed:
+    """Phases called in turn on seeds that each call uses up, and how long each took."""
+
+    def __init__(self, agent: Agent, task: Noise, seeds: int):
+        self.agent, self.step = agent, 0
+        self.program = phases.compile_program(agent, task, capacity=2 * PAPER_STEPS // max(seeds, 1) + 2, episodes=1)
+        self.keys = jax.random.split(jax.random.key(0), seeds)
+        self.seeds = jax.block_until_ready(self.program.begin(self.keys))
+
+    def explore(self, steps: int) -> float:
+        return self._call(lambda seeds: self.program.explore(seeds, self.step, steps)[0], steps)
+
+    def pretrain(self, updates: int) -> float:
+        return self._call(lambda seeds: self.program.pretrain(seeds, 0, updates)[0], 0)
+
+    def learn(self, cycles: int) -> float:
+        return self._call(lambda seeds: self.program.learn(seeds, self.step, cycles)[0], cycles * self.agent.cycle)
+
+    def _call(self, phase: Callable[[phases.Seed], phases.Seed], steps: int) -> float:
+        """Seconds of one call."""
+        before = time.perf_counter()
+        self.seeds = jax.block_until_ready(phase(self.seeds))
+        self.step += steps
+        return time.perf_counter() - before
+
+
+def bench(agent: Agent, obs: int, actions: int, seeds: int = 1, started: float | None = None) -> dict[str, Any]:
+    """Time an agent's training with observations and actions of these sizes, `seeds` of them in one program.
+
+    Args:
+        agent: its hyperparameters count.
+        obs, actions: sizes of the task's observation and action.
+        seeds: all times are of a step of all seeds together.
+        started: `time.time()` at which the program began, for `first_training_step_s`.
+
+    Returns:
+        ms_per_step and its parts acting_ms, controller_update_ms, model_update_ms, pretraining_ms, all per environment
+        step; pretraining_ms_per_update; first_training_step_s (from the program's start to the end of the first
+        cycle of learning, exploration and pre-training cut to one stretch); compile_s, its part that is compilation;
+        matmul_gflops, gflop_per_step, share_of_peak; parameters of one seed; obs, actions, seeds.
+    """
+    started = time.time() if started is None else started
+    stretch = phases.stretch_length(agent)
+    cycles = stretch // agent.cycle
+    timed = _Timed(agent, Noise(obs, actions), seeds)
+    first = [timed.explore(stretch), timed.pretrain(1) if agent.pretrain_updates else 0.0, timed.learn(1)]
+    first_training_step = time.time() - started
+
+    acting = _per(timed.explore, stretch)
+    pretraining = _per(timed.pretrain, 10) if agent.pretrain_updates else 0.0
+    whole = _per(lambda count: timed.learn(count // agent.cycle), cycles * agent.cycle)
+    parts, flop = _update_parts(agent, timed)
+    pretraining_per_step = pretraining * agent.pretrain_updates / PAPER_STEPS
+    peak = matmul_gflops()
+    return {
+        "ms_per_step": 1e3 * (whole + pretraining_per_step),
+        "acting_ms": 1e3 * acting,
+        **{f"{name}_ms": 1e3 * seconds for name, seconds in parts.items()},
+        "pretraining_ms": 1e3 * pretraining_per_step,
+        "pretraining_ms_per_update": 1e3 * pretraining,
+        "first_training_step_s": first_training_step,
+        "compile_s": sum(first),
+        "matmul_gflops": peak,
+        "gflop_per_step": flop / 1e9,
+        "share_of_peak": flop / whole / 1e9 / peak,
+        "parameters": parameters(timed.seeds.state) // seeds,
+        "obs": obs,
+        "actions": actions,
+        "seeds": seeds,
+        "device": str(jax.devices()[0].device_kind),
+    }
+
+
+def _per(call: Callable[[int], float], count: int) -> float:
+    """Median seconds of one of `count` things that a call does; the first call is not counted."""
+    return statistics.median([call(count) for _ in range(REPEATS + 1)][1:]) / count
+
+
+def _update_parts(agent: Agent, timed: _Timed) -> tuple[dict[str, float], float]:
+    """Seconds of an environment step's share of the updates, and the floating-point operations of both together."""
+    seeds = timed.seeds
+
+    def sample(replay: ring.Replay, key: Key[Array, ""]):
+        return ring.sample(replay, key, agent.cycle_windows, agent.window)
+
+    windows = jax.jit(jax.vmap(sample))(seeds.replay, timed.keys)
+    begin_args = (seeds.state, windows, timed.keys)
+    # Where only the state is asked for, XLA drops the beliefs, so the difference is what they cost.
+    model = jax.jit(jax.vmap(lambda *args: agent.begin_cycle(*args)[0])).lower(*begin_args).compile()
+    begin = jax.jit(jax.vmap(lambda *args: agent.begin_cycle(*args)[:2])).lower(*begin_args).compile()
+    state, batches = begin(*begin_args)
+    batch = jax.tree.map(lambda leaf: leaf[:, 0], batches)
+    update = jax.jit(jax.vmap(lambda *args: agent.update(*args)[0])).lower(state, batch, timed.keys).compile()
+
+    s_model, s_begin = median_seconds(lambda: model(*begin_args)), median_seconds(lambda: begin(*begin_args))
+    s_update = median_seconds(lambda: update(state, batch, timed.keys)) / agent.train_interval_rl
+    parts = {
+        "controller_update": s_update + max(s_begin - s_model, 0.0) / agent.cycle,
+        "model_update": s_model / agent.cycle,
+    }
+    flop = _flop(begin) / agent.cycle + _flop(update) / agent.train_interval_rl
+    return parts, flop
+
+
+def _flop(compiled: Any) -> float:
+    """Floating-point operations of a compiled function by XLA's own count."""
+    analysis = compiled.cost_analysis()
+    analysis = analysis[0] if isinstance(analysis, list) else analysis
+    return float(np.nan_to_num(analysis.get("flops", 0.0)))

@@ -1,0 +1,114 @@
+"""What a training shows while it runs, and the tables at the end."""
+
+import time
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
+from rich.table import Table
+
+from beliefrl.train import Event
+
+
+def duration(seconds: float) -> str:
+    """Seconds as 12 s, 3:04 or 1:02:03."""
+    if seconds < 60:
+        return f"{seconds:.0f} s"
+    minutes, seconds = divmod(int(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
+
+
+class TrainingDisplay:
+    """A live bar with what is being done, steps/s, time left and the last returns; a line for every evaluation.
+
+    Where the output is not a terminal, only the lines.
+    """
+
+    def __init__(self, console: Console, steps: int, start: int):
+        """`steps` of each seed in all, of which `start` only explore."""
+        self.console, self.steps, self.start = console, steps, start
+        columns = (TextColumn("{task.description:<26}"), BarColumn(), TextColumn("{task.fields[told]}"))
+        self.progress = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+        self.bar = self.progress.add_task("starting", total=steps, told="")
+        self.returns = ""
+        self.doing = ""
+        self.began = self.phase_began = time.monotonic()
+        self.phase_step = 0
+
+    def __enter__(self) -> "TrainingDisplay":
+        self.progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.progress.stop()
+
+    def __call__(self, event: Event) -> None:
+        """Show an event."""
+        now = time.monotonic()
+        if event.doing != self.doing and event.evaluation is None:
+            self._begin_phase(event, now)
+        if event.episodes is not None and np.any(event.episodes.done):
+            ended = np.asarray(event.episodes.total)[np.asarray(event.episodes.done)]
+            self.returns = f"last returns {ended.mean():.1f}"
+        if event.part:
+            done, of = event.part
+            left = (now - self.phase_began) / done * (of - done)
+            told = f"{done:,}/{of:,} updates, {duration(left)} left in this phase"
+            self.progress.update(self.bar, completed=done, total=of, description=event.doing, told=told)
+        else:
+            told = f"step {event.step:,}/{self.steps:,}  {self._speed(event, now)}  {self.returns}"
+            self.progress.update(
+                self.bar, completed=event.step, total=self.steps, description=event.doing, told=told
+            )
+        if event.evaluation is not None:
+            self._evaluated(event, now)
+
+    def _begin_phase(self, event: Event, now: float) -> None:
+        """Say what begins; time it from after its compilation."""
+        resumes = self.doing == "evaluating" and event.doing == "learning"
+        if not resumes and event.doing != "evaluating":
+            self.phase_began, self.phase_step = now, event.step
+            if not self.console.is_terminal:
+                self.console.print(f"[{duration(now - self.began)}] {event.doing}", markup=False, highlight=False)
+        self.doing = event.doing
+
+    def _speed(self, event: Event, now: float) -> str:
+        steps = event.step - self.phase_step
+        if steps <= 0:
+            return "(a minute at most)" if event.doing.startswith("compiling") else ""
+        rate = steps / (now - self.phase_began)
+        return f"{rate:.0f} steps/s, {duration((self.steps - event.step) / rate)} left"
+
+    def _evaluated(self, event: Event, now: float) -> None:
+        result = event.evaluation
+        assert result is not None
+        total, success = np.asarray(result.total), np.asarray(result.success)
+        line = f"[{duration(now - self.began)}] step {event.step:,}: return {total[:, 0].mean():.1f} sampled, {total[:, 1].mean():.1f} mode"
+        if success.any():
+            line += f"; success {success[:, 0].mean():.0%} sampled, {success[:, 1].mean():.0%} mode"
+        self.console.print(line, markup=False, highlight=False)
+
+
+def results_table(results: dict[str, Any], seeds: list[int], title: str) -> Table:
+    """Returns of every seed, and over seeds mean and standard error, with sampled and with mode actions."""
+    table = Table(title=title, title_justify="left")
+    with_success = results["sampled"]["success"] is not None
+    for heading in ("seed", "sampled actions", "mode actions", *(["success sampled", "success mode"] * with_success)):
+        table.add_column(heading, justify="right")
+    for index, seed in enumerate(seeds):
+        cells = [f"{results[mode]['seeds'][index]:.1f}" for mode in ("sampled", "mode")]
+        if with_success:
+            cells += [f"{results[mode]['seeds_success'][index]:.0%}" for mode in ("sampled", "mode")]
+        table.add_row(str(seed), *cells)
+    table.add_section()
+    cells = [_mean(results[mode]) for mode in ("sampled", "mode")]
+    if with_success:
+        cells += [f"{results[mode]['success']:.0%}" for mode in ("sampled", "mode")]
+    table.add_row("mean ± S.E.M.", *cells)
+    return table
+
+
+def _mean(mode: dict[str, Any]) -> str:
+    return f"{mode['mean']:.1f}" + (f" ± {mode['sem']:.1f}" if mode["sem"] is not None else "")

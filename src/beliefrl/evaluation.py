@@ -1,0 +1,85 @@
+"""What a trained agent is worth: returns over episodes and seeds, with sampled and with mode actions."""
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from beliefrl import agents, tasks
+from beliefrl.agents import Agent
+from beliefrl.phases import evaluate as evaluate_seed
+from beliefrl.rollout import Episode
+from beliefrl.runs import Run
+from beliefrl.tasks import Task
+from beliefrl.types import UserError
+
+MODES = ("sampled", "mode")  # how actions are chosen; the first axis of an evaluation's leaves behind seeds
+
+
+def summary(result: Episode, has_success: bool) -> dict[str, Any]:
+    """Per mode: every seed's mean return, their mean, its standard error over seeds (None with one), and success.
+
+    Leaves of `result` are (seed, mode, episodes).
+    """
+    total, success = np.asarray(result.total), np.asarray(result.success)
+    table = {}
+    for index, mode in enumerate(MODES):
+        seeds = total[:, index].mean(axis=-1)
+        table[mode] = {
+            "mean": float(seeds.mean()),
+            "sem": float(seeds.std(ddof=1) / np.sqrt(seeds.size)) if seeds.size > 1 else None,
+            "seeds": [float(mean) for mean in seeds],
+            "success": float(success[:, index].mean()) if has_success else None,
+            "seeds_success": [float(rate) for rate in success[:, index].mean(axis=-1)] if has_success else None,
+        }
+    return table
+
+
+def restore(run: Run, task: Task | None = None) -> tuple[Agent, Task, Any]:
+    """The agent, the task and the trained states (leading axis: seed) of a run.
+
+    `task` is needed only where the run was trained on a task of your own.
+
+    Raises:
+        UserError: the run's agent or task is unknown here, or nothing was saved.
+    """
+    config = run.config
+    agent = agents.make(config["agent"], **_tuples(config["hyperparameters"]))
+    if task is None:
+        if config["task"] not in tasks.names():
+            raise UserError(f"{run.folder} was trained on {config['task']}, which is not a task of this library: pass task=.")
+        task = tasks.make(config["task"], **_tuples(config["constants"]))
+    spec = task.spec
+    keys = jax.random.split(jax.random.key(0), len(run.seeds))
+    like = jax.eval_shape(jax.vmap(lambda key: agent.init(key, spec)), keys)
+    return agent, task, run.load(like)
+
+
+def _tuples(values: dict[str, Any]) -> dict[str, Any]:
+    """JSON's lists as the tuples they were."""
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+
+
+def evaluate(run: Run | str, episodes: int = 20, seed: int = 0, task: Task | None = None) -> dict[str, Any]:
+    """Let the trained agents of a run play `episodes` new episodes, once with sampled and once with mode actions.
+
+    Args:
+        run: a run, or its folder.
+        episodes: episodes for each seed of the run and each mode.
+        seed: of these episodes: the same seed gives the same numbers.
+        task: needed only where the run was trained on a task of your own.
+
+    Returns:
+        {"episodes", "sampled": {"mean", "sem", "seeds", "success", "seeds_success"}, "mode": the same}. Returns are
+        undiscounted; "sem" is over seeds and None with one; success is a rate in [0, 1], None where a task has none.
+
+    Raises:
+        UserError: there is no such run, nothing was saved in it, or `episodes` is below 1.
+    """
+    if episodes < 1:
+        raise UserError(f"episodes={episodes} is impossible: it must be at least 1.")
+    run = run if isinstance(run, Run) else Run(run)
+    agent, task, states = restore(run, task)
+    keys = jax.random.split(jax.random.key(seed), len(run.seeds))
+    play = jax.jit(jax.vmap(lambda state, key: evaluate_seed(agent, task, state, key, episodes)))
+    return {"episodes": episodes} | summary(play(states, keys), task.spec.has_success)

@@ -1,0 +1,192 @@
+"""A run's folder: what a training leaves behind. Knows files, no reinforcement learning.
+
+    config.json           agent, task, options, versions, git commit, command line
+    metrics/seed-0.jsonl  a line for every entry: {"step", "kind": "update" | "episode" | "evaluation", ...}
+    tensorboard/seed-0/   the same as TensorBoard events
+    agent.safetensors     the agents of all seeds at the last evaluation (leading axis: seed); plain arrays, no code
+    results.json          the returns of the last evaluation
+    curve.png             the learning curve
+
+Lines are written out one by one, so a killed training loses at most the line it was writing, which `rows` skips.
+"""
+
+import json
+import os
+import pathlib
+import platform
+import subprocess
+import sys
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from importlib import metadata
+from typing import Any
+
+import jax
+import numpy as np
+import safetensors
+import safetensors.numpy
+
+from beliefrl.types import UserError
+
+Row = dict[str, Any]
+PACKAGES = ("beliefrl", "jax", "jaxlib", "equinox", "optax", "numpy")
+
+
+class Run:
+    """A run's folder, to be read."""
+
+    def __init__(self, folder: str | os.PathLike[str]):
+        """Open a folder that a training made.
+
+        Raises:
+            UserError: it does not exist, or no training made it.
+        """
+        self.folder = pathlib.Path(folder)
+        if not self.folder.is_dir():
+            raise UserError(f"There is no run folder {self.folder}: give the --out of a training.")
+        path = self.folder / "config.json"
+        try:
+            self.config: dict[str, Any] = json.loads(path.read_text())
+        except FileNotFoundError:
+            raise UserError(f"{self.folder} is not a run: it has no config.json; give the --out of a training.") from None
+        except (OSError, ValueError):
+            raise UserError(f"{path} cannot be read as JSON: restore it, or train again.") from None
+
+    @property
+    def seeds(self) -> list[int]:
+        """The numbers of the run's seeds."""
+        first, count = self.config["options"]["seed"], self.config["options"]["seeds"]
+        return list(range(first, first + count))
+
+    def rows(self, seed: int, kind: str | None = None) -> Iterator[Row]:
+        """The log of a seed in the order it was written; of one kind, if given."""
+        path = self.folder / "metrics" / f"seed-{seed}.jsonl"
+        if not path.exists():
+            return
+        with path.open() as lines:
+            for line in lines:
+                if line.endswith("\n"):
+                    row = json.loads(line)
+                    if kind in (None, row["kind"]):
+                        yield row
+
+    def results(self) -> Row | None:
+        """The summary of the last evaluation; None before there was one."""
+        path = self.folder / "results.json"
+        return json.loads(path.read_text()) if path.exists() else None
+
+    def load(self, like: Any) -> Any:
+        """The saved agents, in a tree of the structure, shapes and types of `like`.
+
+        Raises:
+            UserError: nothing was saved yet, or what was saved is damaged or of another shape.
+        """
+        path = self.folder / "agent.safetensors"
+        if not path.exists():
+            raise UserError(f"{self.folder} has no trained agent yet: it is saved at the first evaluation.")
+        try:
+            saved = safetensors.numpy.load_file(path)
+        except (OSError, safetensors.SafetensorError):
+            raise UserError(f"{path} is damaged: restore it from a copy, or train again.") from None
+        leaves, structure = jax.tree_util.tree_flatten_with_path(like)
+        names = [jax.tree_util.keystr(where) for where, _ in leaves]
+        for name, (_, leaf) in zip(names, leaves, strict=True):
+            if name not in saved or saved[name].shape != leaf.shape or saved[name].dtype != leaf.dtype:
+                raise UserError(f"{path} does not fit the agent in config.json (at {name}): they are not of one training.")
+        return jax.tree_util.tree_unflatten(structure, [saved[name] for name in names])
+
+
+class Recorder(Run):
+    """A run's folder, to be written."""
+
+    def __init__(self, folder: str | os.PathLike[str], config: dict[str, Any]):
+        """Make the folder.
+
+        Raises:
+            UserError: it exists already, or cannot be made.
+        """
+        folder = pathlib.Path(folder)
+        if folder.exists():
+            raise UserError(f"{folder} exists already: choose another --out, or remove it.")
+        try:
+            (folder / "metrics").mkdir(parents=True)
+            write_whole(folder / "config.json", (json.dumps(config, indent=2) + "\n").encode())
+        except OSError as error:
+            raise UserError(f"The run folder {folder} cannot be made ({error.strerror}): choose another --out.") from None
+        super().__init__(folder)
+        from tensorboardX import SummaryWriter  # 0.5 s to import
+
+        self._lines = {seed: (folder / "metrics" / f"seed-{seed}.jsonl").open("a", buffering=1) for seed in self.seeds}
+        self._events = {seed: SummaryWriter(str(folder / "tensorboard" / f"seed-{seed}")) for seed in self.seeds}
+
+    def log(self, seed: int, kind: str, step: int, values: Row) -> None:
+        """Write one entry of a seed; numbers go to TensorBoard as well, of lists their mean."""
+        self._lines[seed].write(json.dumps({"step": step, "kind": kind, **values}) + "\n")
+        for name, value in values.items():
+            if value is not None:
+                self._events[seed].add_scalar(f"{kind}/{name}", float(np.mean(value)), step)
+
+    def flush(self) -> None:
+        """Bring everything logged so far onto the disk."""
+        for writer in self._events.values():
+            writer.flush()
+
+    def save(self, agents: Any) -> None:
+        """Save the agents of all seeds; the file appears whole or not at all."""
+        leaves = jax.tree_util.tree_leaves_with_path(agents)
+        arrays = {jax.tree_util.keystr(where): np.ascontiguousarray(leaf) for where, leaf in leaves}
+        write_whole(self.folder / "agent.safetensors", safetensors.numpy.save(arrays))
+
+    def finish(self, results: Row) -> None:
+        """Write the summary of the last evaluation and close the logs."""
+        write_whole(self.folder / "results.json", (json.dumps(results, indent=2) + "\n").encode())
+        self.close()
+
+    def close(self) -> None:
+        """Close the logs."""
+        for writer in (*self._lines.values(), *self._events.values()):
+            writer.close()
+
+
+def write_whole(path: pathlib.Path, content: bytes) -> None:
+    """Write a file so that it is either the old one or the new one whole, whatever happens meanwhile."""
+    temporary = path.with_name(f".{path.name}.tmp")
+    with temporary.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+
+
+def free_folder(name: str, parent: str = "runs") -> pathlib.Path:
+    """The first of runs/NAME-1, runs/NAME-2, ... that does not exist."""
+    number = 1
+    while (folder := pathlib.Path(parent) / f"{name}-{number}").exists():
+        number += 1
+    return folder
+
+
+def provenance() -> dict[str, Any]:
+    """What a run was made with: versions, machine, git commit, command line and time."""
+    return {
+        "versions": {"python": platform.python_version()} | {name: metadata.version(name) for name in PACKAGES},
+        "device": str(jax.devices()[0].device_kind),
+        "git_commit": _git_commit(),
+        "command": [os.path.basename(sys.argv[0]), *sys.argv[1:]],
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+def _git_commit() -> str | None:
+    """The commit of the source that is running, with a + where it was changed since; None outside a checkout."""
+    try:
+        found = subprocess.run(
+            ["git", "describe", "--always", "--abbrev=40", "--dirty=+", "--match="],
+            cwd=pathlib.Path(__file__).parent,
+            capture_output=True,
+            text=True,
+            timeout=10,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return found.stdout.strip() or None

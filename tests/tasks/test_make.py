@@ -1,0 +1,103 @@
+"""Tasks by name: their sizes, their masks, the errors of a user, and what every task keeps to."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from beliefrl.tasks import make, names, observe
+from beliefrl.types import UserError
+
+SIZES = {  # obs_dim, action_dim, max_steps, has_success
+    "pendulum": (3, 1, 200, False),
+    "pendulum-v": (1, 1, 200, False),
+    "pendulum-p": (2, 1, 200, False),
+    "cartpole": (4, 1, 1000, False),
+    "cartpole-v": (2, 1, 1000, False),
+    "cartpole-p": (2, 1, 1000, False),
+    "target-reaching": (12, 2, 128, True),
+}
+SEEN = {"pendulum-v": [2], "pendulum-p": [0, 1], "cartpole-v": [1, 3], "cartpole-p": [0, 2]}
+KEYS = jax.random.split(jax.random.key(0), 5)
+
+
+def test_the_listed_names_are_the_tasks_there_are():
+    assert list(names()) == list(SIZES)
+    assert all(names().values())
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_sizes_and_limits(name):
+    assert tuple(make(name).spec) == SIZES[name]
+
+
+@pytest.mark.parametrize("name", SEEN)
+def test_a_mask_hides_all_other_entries_and_changes_nothing_else(name):
+    full, masked = make(name[:-2]), make(name)
+    (state, obs), (masked_state, masked_obs) = full.reset(KEYS[0]), masked.reset(KEYS[0])
+    np.testing.assert_array_equal(masked_obs, obs[jnp.array(SEEN[name])])
+    action = jnp.array([0.3])
+    _, obs, reward, terminated = full.step(state, action, KEYS[1])
+    after, masked_obs, masked_reward, masked_terminated = masked.step(masked_state, action, KEYS[1])
+    np.testing.assert_array_equal(masked_obs, obs[jnp.array(SEEN[name])])
+    assert (masked_reward, masked_terminated) == (reward, terminated)
+    assert not masked.success(after)
+
+
+def test_observe_keeps_the_order_that_was_asked_for():
+    task = make("target-reaching")
+    some = observe(task, (11, 0, 4))
+    np.testing.assert_array_equal(some.reset(KEYS[0])[1], task.reset(KEYS[0])[1][jnp.array([11, 0, 4])])
+    assert some.spec == task.spec._replace(obs_dim=3)
+
+
+@pytest.mark.parametrize("indices", [(), (3,), (0, -1)])
+def test_observe_refuses_entries_that_are_not_there(indices):
+    with pytest.raises(UserError, match="indices from 0 to 2"):
+        observe(make("pendulum"), indices)
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [("pendulm", "did you mean pendulum"), ("target_reaching", "did you mean target-reaching"), ("zzz", "beliefrl tasks")],
+)
+def test_an_unknown_name_gets_a_hint(name, hint):
+    with pytest.raises(UserError, match=f"no task '{name}'.*{hint}"):
+        make(name)
+
+
+def test_a_task_without_velocities_has_no_masks():
+    with pytest.raises(UserError, match="no task 'target-reaching-v'"):
+        make("target-reaching-v")
+
+
+@pytest.mark.parametrize("name", ["cartpole", "cartpole-v"])
+def test_an_unknown_constant_is_refused_with_those_there_are(name):
+    with pytest.raises(UserError, match="cartpole has no constant 'mass'.*cart_mass, pole_mass"):
+        make(name, mass=1.0)
+
+
+@pytest.mark.parametrize("name", ["pendulum", "pendulum-v"])
+def test_constants_are_replaced(name):
+    assert make(name, max_steps=50).spec.max_steps == 50
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_tasks_can_be_compiled_and_batched(name):
+    task = make(name)
+    actions = jax.random.uniform(KEYS[0], (5, task.spec.action_dim), minval=-1, maxval=1)
+    states, first = jax.jit(jax.vmap(task.reset))(KEYS)
+    _, obs, reward, terminated = jax.jit(jax.vmap(task.step))(states, actions, KEYS)
+    assert first.shape == obs.shape == (5, task.spec.obs_dim)
+    assert (obs.dtype, reward.dtype, terminated.dtype) == (jnp.float32, jnp.float32, jnp.bool_)
+    alone = task.step(task.reset(KEYS[3])[0], actions[3], KEYS[3])
+    np.testing.assert_allclose(obs[3], alone[1], rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(reward[3], alone[2], rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["pendulum", "cartpole", "target-reaching"])
+def test_a_step_keeps_the_types_of_a_state(name):
+    task = make(name)
+    state = task.reset(KEYS[0])[0]
+    after = task.step(state, jnp.zeros(task.spec.action_dim), KEYS[0])[0]
+    assert jax.tree.map(jax.typeof, after) == jax.tree.map(jax.typeof, state)
