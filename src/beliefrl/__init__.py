@@ -1,11 +1,11 @@
 """BeliefRL: reinforcement learning for agents that do not see the whole state.
 
-    import beliefrl
+import beliefrl
 
-    agent = beliefrl.make_agent("vrm")
-    task = beliefrl.make_task("pendulum-v")
-    run = beliefrl.train(agent, task, steps=15_000, seeds=3, out="runs/first")
-    print(beliefrl.evaluate(run, episodes=20))
+agent = beliefrl.make_agent("vrm")
+task = beliefrl.make_task("pendulum-v")
+run = beliefrl.train(agent, task, steps=15_000, seeds=3, out="runs/first")
+print(beliefrl.evaluate(run, episodes=20))
 """
 
 from importlib.metadata import version

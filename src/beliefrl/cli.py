@@ -86,7 +86,9 @@ def train(argv: Sequence[str]) -> None:
         agents.find(name),
         {
             "task": (
-                Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK", help="`beliefrl tasks` lists them.")],
+                Annotated[
+                    tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK", help="`beliefrl tasks` lists them.")
+                ],
                 dataclasses.MISSING,
             ),
             "training": (Annotated[Options, tyro.conf.arg(name="", help="How long, how often.")], Options()),
@@ -108,7 +110,9 @@ def train(argv: Sequence[str]) -> None:
     results = run.results() or {}
     title = f"{name} on {options.task} after {results['step']:,} steps"
     console.print(results_table(results, run.seeds, title))
-    console.print(f"saved in {run.folder}: see curve.png; `beliefrl evaluate {run.folder}` plays more episodes", highlight=False)
+    console.print(
+        f"saved in {run.folder}: see curve.png; `beliefrl evaluate {run.folder}` plays more episodes", highlight=False
+    )
 
 
 def evaluate(argv: Sequence[str]) -> None:
@@ -192,7 +196,8 @@ def _agent_name(argv: Sequence[str], command: str, more: str = "") -> tuple[str,
     """The agent's name and what follows it."""
     usage = f"beliefrl {command} AGENT {more}".rstrip()
     if argv and argv[0] in ("-h", "--help"):
-        print(f"usage: {usage} ...\n\n`beliefrl agents` lists the agents; name one for its options: beliefrl {command} vrm --help")
+        print(f"usage: {usage} ...\n")
+        print(f"`beliefrl agents` lists the agents; name one to see its options: beliefrl {command} vrm --help")
         raise SystemExit(0)
     if not argv or argv[0].startswith("-"):
         raise UsageError(f"No agent is named: write {usage}; `beliefrl agents` lists them.")
@@ -216,7 +221,9 @@ def _parse(options: Any, argv: Sequence[str], prog: str) -> Any:
 
 def _sentence(box: str) -> str:
     """The message in a box that tyro drew, on one line."""
-    lines = [re.sub(r"^[│|]\s?|\s*[│|]$", "", line).strip() for line in box.splitlines() if not line.startswith(("╭", "╰"))]
+    lines = [
+        re.sub(r"^[│|]\s?|\s*[│|]$", "", line).strip() for line in box.splitlines() if not line.startswith(("╭", "╰"))
+    ]
     message = []
     for line in lines:
         if line.startswith("─"):

@@ -59,9 +59,7 @@ class TrainingDisplay:
             self.progress.update(self.bar, completed=done, total=of, description=event.doing, told=told)
         else:
             told = f"step {event.step:,}/{self.steps:,}  {self._speed(event, now)}  {self.returns}"
-            self.progress.update(
-                self.bar, completed=event.step, total=self.steps, description=event.doing, told=told
-            )
+            self.progress.update(self.bar, completed=event.step, total=self.steps, description=event.doing, told=told)
         if event.evaluation is not None:
             self._evaluated(event, now)
 
@@ -85,7 +83,8 @@ class TrainingDisplay:
         result = event.evaluation
         assert result is not None
         total, success = np.asarray(result.total), np.asarray(result.success)
-        line = f"[{duration(now - self.began)}] step {event.step:,}: return {total[:, 0].mean():.1f} sampled, {total[:, 1].mean():.1f} mode"
+        means = f"return {total[:, 0].mean():.1f} sampled, {total[:, 1].mean():.1f} mode"
+        line = f"[{duration(now - self.began)}] step {event.step:,}: {means}"
         if success.any():
             line += f"; success {success[:, 0].mean():.0%} sampled, {success[:, 1].mean():.0%} mode"
         self.console.print(line, markup=False, highlight=False)

@@ -47,7 +47,9 @@ def restore(run: Run, task: Task | None = None) -> tuple[Agent, Task, Any]:
     agent = agents.make(config["agent"], **_tuples(config["hyperparameters"]))
     if task is None:
         if config["task"] not in tasks.names():
-            raise UserError(f"{run.folder} was trained on {config['task']}, which is not a task of this library: pass task=.")
+            raise UserError(
+                f"{run.folder} was trained on {config['task']}, which is not a task of this library: pass task=."
+            )
         task = tasks.make(config["task"], **_tuples(config["constants"]))
     spec = task.spec
     keys = jax.random.split(jax.random.key(0), len(run.seeds))

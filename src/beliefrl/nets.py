@@ -5,14 +5,19 @@ weights and biases uniform in ±1/√fan_in (Equinox's Linear), an LSTM's in ±1
 """
 
 from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optax
 from jaxtyping import Array, Float, Key
 
 LOG_2PI = 1.8378770664093453
 TANH_EPSILON = 1e-6  # keeps the log-probability of a squashed action finite at ±1
+
+
+Params = TypeVar("Params")
 
 
 class MLP(eqx.Module):
@@ -38,7 +43,7 @@ class MLP(eqx.Module):
 
 
 @jax.custom_vjp
-def lstm_state(gates: Float[Array, "*lead 4*d"], c: Float[Array, "*lead d"]) -> tuple[Array, Array]:
+def lstm_state(gates: Float[Array, "*lead gates"], c: Float[Array, "*lead d"]) -> tuple[Array, Array]:
     """(d, c) of the next step from the gates' pre-activations i, f, g, o, each (*lead, d):
 
     c' = σ(f) c + σ(i) tanh g,   d' = σ(o) tanh c'
@@ -100,3 +105,12 @@ def tanh_gaussian(
     action = jnp.tanh(mean + sigma * noise)
     log_prob = -0.5 * (noise**2 + LOG_2PI) - log_sigma - jnp.log(1 - action**2 + TANH_EPSILON)
     return action, jnp.sum(log_prob)
+
+
+def descend(
+    optimiser: optax.GradientTransformation, gradient: Params, state: optax.OptState, params: Params
+) -> tuple[Params, optax.OptState]:
+    """One step of an optimiser; returns the new parameters and its new state."""
+    tree: Any = params  # optax's types know only trees of its own making
+    updates, state = optimiser.update(gradient, state, tree)  # pyright: ignore[reportArgumentType]
+    return optax.apply_updates(tree, updates), state  # pyright: ignore[reportReturnType]

@@ -16,7 +16,7 @@ from beliefrl.types import Moment, Step, Window, WindowShape
 
 class Replay(NamedTuple):
     moments: Moment  # leaves (capacity, ...)
-    count: Int[Array, ""]  # moments ever added; the ring holds the last `capacity` of them
+    added: Int[Array, ""]  # moments ever added; the ring holds the last `capacity` of them
 
 
 def init(moment: Moment, capacity: int) -> Replay:
@@ -32,9 +32,9 @@ def capacity(replay: Replay) -> int:
 def add(replay: Replay, moment: Moment, keep: Bool[Array, ""] | bool = True) -> Replay:
     """Append a moment where `keep`; the oldest makes room."""
     size = capacity(replay)
-    index = jnp.where(keep, replay.count % size, size)
+    index = jnp.where(keep, replay.added % size, size)
     moments = jax.tree.map(lambda ring, leaf: ring.at[index].set(leaf, mode="drop"), replay.moments, moment)
-    return Replay(moments, replay.count + jnp.asarray(keep, replay.count.dtype))
+    return Replay(moments, replay.added + jnp.asarray(keep, replay.added.dtype))
 
 
 def sample(replay: Replay, key: Key[Array, ""], batch: int, shape: WindowShape) -> Window:
@@ -45,8 +45,8 @@ def sample(replay: Replay, key: Key[Array, ""], batch: int, shape: WindowShape) 
     than a window needs the rest overhangs as well. What overhangs is marked in `exists`.
     """
     size = capacity(replay)
-    oldest = jnp.maximum(replay.count - size, 0)
-    stored = replay.count - oldest
+    oldest = jnp.maximum(replay.added - size, 0)
+    stored = replay.added - oldest
     start = jax.random.randint(key, (batch, 1), 0, jnp.maximum(stored - shape.length, 1))
     position = start + jnp.arange(-shape.burn_in, shape.length + 1)[None]  # 0 is the oldest moment
     moments = gather(replay, oldest + position)
@@ -63,7 +63,7 @@ def gather(replay: Replay, number: Int[Array, "*shape"]) -> Moment:
 def history(replay: Replay, length: int) -> tuple[Step, Bool[Array, " length"]]:
     """The first `length` moments ever added, and which of them exist; meant for before the ring is full."""
     number = jnp.arange(length)
-    return gather(replay, number).step, number < replay.count
+    return gather(replay, number).step, number < replay.added
 
 
 def annotate(replay: Replay, notes: Any, length: int) -> Replay:

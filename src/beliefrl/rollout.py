@@ -100,7 +100,9 @@ def advance(
     return actor, replay, episode
 
 
-def relive(agent: Agent, state: Any, actor: Actor, replay: Replay, key: Key[Array, ""], length: int) -> tuple[Actor, Replay]:
+def relive(
+    agent: Agent, state: Any, actor: Actor, replay: Replay, key: Key[Array, ""], length: int
+) -> tuple[Actor, Replay]:
     """Perceive the first `length` moments of the replay again with networks that have changed since.
 
     Returns the actor with the memory it would have now, and the replay with new notes.

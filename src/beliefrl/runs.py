@@ -48,7 +48,9 @@ class Run:
         try:
             self.config: dict[str, Any] = json.loads(path.read_text())
         except FileNotFoundError:
-            raise UserError(f"{self.folder} is not a run: it has no config.json; give the --out of a training.") from None
+            raise UserError(
+                f"{self.folder} is not a run: it has no config.json; give the --out of a training."
+            ) from None
         except (OSError, ValueError):
             raise UserError(f"{path} cannot be read as JSON: restore it, or train again.") from None
 
@@ -92,7 +94,9 @@ class Run:
         names = [jax.tree_util.keystr(where) for where, _ in leaves]
         for name, (_, leaf) in zip(names, leaves, strict=True):
             if name not in saved or saved[name].shape != leaf.shape or saved[name].dtype != leaf.dtype:
-                raise UserError(f"{path} does not fit the agent in config.json (at {name}): they are not of one training.")
+                raise UserError(
+                    f"{path} does not fit the agent in config.json (at {name}): they are not of one training."
+                )
         return jax.tree_util.tree_unflatten(structure, [saved[name] for name in names])
 
 
@@ -112,7 +116,9 @@ class Recorder(Run):
             (folder / "metrics").mkdir(parents=True)
             write_whole(folder / "config.json", (json.dumps(config, indent=2) + "\n").encode())
         except OSError as error:
-            raise UserError(f"The run folder {folder} cannot be made ({error.strerror}): choose another --out.") from None
+            raise UserError(
+                f"The run folder {folder} cannot be made ({error.strerror}): choose another --out."
+            ) from None
         super().__init__(folder)
         from tensorboardX import SummaryWriter  # 0.5 s to import
 

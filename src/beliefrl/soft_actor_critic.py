@@ -7,8 +7,9 @@ Source: Section 3.3 of the paper (after Haarnoja et al. 2018, 2019), with s the 
     J_π = E α log π(ã|s) - min_i Q_i(s, ã)  +  regulariser · ½ E (μ² + σ²)
     J_α = E -log α (log π(ã|s) + H_target)
 
-ã is one sample, used wherever an action is sampled. Departures: the regulariser, and log α for α in J_α (the same
-descent at another speed), are the authors' code's; a time limit is no termination. In each loss the differentiated argument comes first and means are over valid transitions.
+ã is one sample, used wherever an action is sampled. Departures, both from the authors' code: the regulariser, and
+log α in place of α in J_α, which is the same descent at another speed. A time limit is no termination. In each loss
+the differentiated argument comes first, and means are over valid transitions.
 """
 
 from typing import NamedTuple
@@ -19,7 +20,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.nets import MLP, tanh_gaussian
+from beliefrl.nets import MLP, descend, tanh_gaussian
 
 LOG_SIGMA_MIN, LOG_SIGMA_MAX = -20.0, 2.0
 
@@ -190,27 +191,22 @@ class OptimiserState(NamedTuple):
 
 
 def init_optimisers(optimisers: Optimisers, controller: Controller) -> OptimiserState:
-    """Fresh states for `descend`."""
+    """Fresh states for `update`."""
     return OptimiserState(
         optimisers.actor.init(controller.actor),  # pyright: ignore[reportArgumentType]
-        optimisers.critic.init((controller.critics, controller.value)),
+        optimisers.critic.init((controller.critics, controller.value)),  # pyright: ignore[reportArgumentType]
         optimisers.alpha.init(controller.log_alpha),
     )
 
 
-def descend(
+def update(
     optimisers: Optimisers, state: OptimiserState, controller: Controller, gradient: Controller, tau: float
 ) -> tuple[Controller, OptimiserState]:
     """One step of every optimiser, then of V̄ towards the new V."""
-
-    def step(optimiser, grads, opt_state, params):
-        updates, opt_state = optimiser.update(grads, opt_state, params)
-        return optax.apply_updates(params, updates), opt_state
-
-    actor, s_actor = step(optimisers.actor, gradient.actor, state.actor, controller.actor)
-    (critics, value), s_critic = step(
+    actor, s_actor = descend(optimisers.actor, gradient.actor, state.actor, controller.actor)
+    (critics, value), s_critic = descend(
         optimisers.critic, (gradient.critics, gradient.value), state.critic, (controller.critics, controller.value)
     )
-    log_alpha, s_alpha = step(optimisers.alpha, gradient.log_alpha, state.alpha, controller.log_alpha)
+    log_alpha, s_alpha = descend(optimisers.alpha, gradient.log_alpha, state.alpha, controller.log_alpha)
     target = soft_update(controller.target_value, value, tau)
     return Controller(actor, critics, value, target, log_alpha), OptimiserState(s_actor, s_critic, s_alpha)

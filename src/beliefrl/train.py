@@ -20,7 +20,7 @@ from beliefrl.phases import Metrics
 from beliefrl.rollout import Episode
 from beliefrl.runs import Recorder, Run
 from beliefrl.tasks import Task
-from beliefrl.types import UserError
+from beliefrl.types import UserError, check_range
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,11 +42,8 @@ class Options:
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
-        for name in ("steps", "seeds", "eval_every", "eval_episodes", "replay_capacity"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name}={getattr(self, name)} is impossible: it must be at least 1.")
-        if not 0 <= self.seed < 2**31:
-            raise UserError(f"seed={self.seed} is impossible: it must be from 0 to {2**31 - 1}.")
+        check_range(self, ("steps", "seeds", "eval_every", "eval_episodes", "replay_capacity"), 1)
+        check_range(self, ("seed",), 0, 2**31 - 1)
 
 
 class Event(NamedTuple):

@@ -4,6 +4,8 @@ Axis names in shapes, everywhere: `seed` (one training each), `batch` (windows),
 `obs`, `action`, `belief` (what the controller reads), `d` (recurrent state), `z` (latent variable), `x` (perception).
 """
 
+import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from jaxtyping import Array, Bool, Float
@@ -11,6 +13,22 @@ from jaxtyping import Array, Bool, Float
 
 class UserError(Exception):
     """A mistake that the user can mend. Its message is one sentence: what was wrong, and what to do."""
+
+
+def check_range(settings: object, names: Sequence[str], low: int, high: int | float = math.inf) -> None:
+    """Raise a UserError where a field of `settings`, or an entry of a tuple there, is not in [low, high]."""
+    for name in names:
+        value = getattr(settings, name)
+        entries = value if isinstance(value, tuple) else (value,)
+        if not entries or not all(low <= entry <= high for entry in entries):
+            bounds = f"at least {low:g}" if high == math.inf else f"from {low:g} to {high:g}"
+            raise UserError(f"{name}={value} is impossible: it must be {bounds}.")
+
+
+def check_choice(settings: object, name: str, choices: Sequence[str]) -> None:
+    """Raise a UserError where a field of `settings` is none of the choices."""
+    if getattr(settings, name) not in choices:
+        raise UserError(f"{name}={getattr(settings, name)!r} is impossible: it must be {' or '.join(choices)}.")
 
 
 class Spec(NamedTuple):

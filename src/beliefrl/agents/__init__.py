@@ -2,7 +2,7 @@
 
 import dataclasses
 import difflib
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Array, Bool, Float, Key
 
@@ -12,6 +12,7 @@ from beliefrl.types import Spec, Step, UserError, Window, WindowShape
 Metrics = dict[str, Float[Array, ""]]
 
 
+@runtime_checkable
 class Agent(Protocol):
     """A frozen dataclass of hyperparameters whose methods are pure functions.
 

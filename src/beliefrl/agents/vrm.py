@@ -21,19 +21,19 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.nets import tanh_gaussian
+from beliefrl.nets import descend, tanh_gaussian
 from beliefrl.soft_actor_critic import (
     Batch,
     Controller,
     Optimisers,
     OptimiserState,
-    descend,
     gradients,
     init_controller,
     init_optimisers,
+    update,
     valid_mean,
 )
-from beliefrl.types import Spec, Step, UserError, Window, WindowShape, transitions
+from beliefrl.types import Spec, Step, UserError, Window, WindowShape, check_choice, check_range, transitions
 from beliefrl.variational_model import VRM, LSTMState, elbo_terms
 
 Metrics = dict[str, Float[Array, ""]]
@@ -114,29 +114,20 @@ class VRMAgent:
     actor_regulariser: float = 1e-3
     """Weight of half the mean squares of the policy's μ and σ in the actor's loss (the authors' code; 0 is off)."""
     elbo_scaling: Literal["mean", "sum"] = "mean"
-    """Mean (the authors' code, which lr_model was tuned on) or sum (the formula) over the dimensions of z and x."""
+    """Mean (the authors' code; lr_model was tuned on it) or sum (the formula) over the dimensions of z and x."""
     decode_from: Literal["posterior", "prior"] = "posterior"
-    """Where z is drawn from to decode x while training: the posterior (a true ELBO) or the prior (the authors' code)."""
+    """What z is drawn from to decode x in training: the posterior (a true ELBO) or the prior (the authors' code)."""
     store_first_impression: bool = True
     """Keep the first-impression model's d in the replay instead of computing it again for every update."""
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
-        for name in ("seq_len", "batch_size", "train_interval_rl", "train_interval_klvrm", "d_size", "z_size", "hidden_size"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name}={getattr(self, name)} is impossible: it must be at least 1.")
-        for name in ("burn_in", "step_start_rl", "train_times_fivrm", "actor_regulariser"):
-            if getattr(self, name) < 0:
-                raise UserError(f"{name}={getattr(self, name)} is impossible: it must not be negative.")
-        for name in ("lr_actor", "lr_critic", "lr_alpha", "lr_model"):
-            if not getattr(self, name) > 0:
-                raise UserError(f"{name}={getattr(self, name)} is impossible: a learning rate must be positive.")
-        for name in ("gamma", "tau"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise UserError(f"{name}={getattr(self, name)} is impossible: it must be from 0 to 1.")
-        for name in ("policy_layers", "value_layers"):
-            if not getattr(self, name) or min(getattr(self, name)) < 1:
-                raise UserError(f"{name}={getattr(self, name)} is impossible: give at least one layer, each of at least 1.")
+        check_range(self, ("seq_len", "batch_size", "train_interval_rl", "train_interval_klvrm"), 1)
+        check_range(self, ("d_size", "z_size", "hidden_size", "policy_layers", "value_layers"), 1)
+        check_range(self, ("burn_in", "step_start_rl", "train_times_fivrm", "actor_regulariser"), 0)
+        check_range(self, ("lr_actor", "lr_critic", "lr_alpha", "lr_model", "gamma", "tau"), 0, 1)
+        check_choice(self, "elbo_scaling", ("mean", "sum"))
+        check_choice(self, "decode_from", ("posterior", "prior"))
         if self.train_interval_klvrm % self.train_interval_rl:
             raise UserError(
                 f"train_interval_klvrm={self.train_interval_klvrm} is not a multiple of "
@@ -238,8 +229,8 @@ class VRMAgent:
     ) -> tuple[VRM, optax.OptState, Metrics]:
         """One step up the ELBO of the windows' last `seq_len` moments but one."""
         grads, metrics = jax.grad(self.model_loss, has_aux=True)(vrm, windows, key)
-        updates, optimiser = self.model_optimiser.update(grads, optimiser)
-        return optax.apply_updates(vrm, updates), optimiser, metrics  # pyright: ignore[reportReturnType, reportArgumentType]
+        vrm, optimiser = descend(self.model_optimiser, grads, optimiser, vrm)
+        return vrm, optimiser, metrics
 
     def model_loss(self, vrm: VRM, windows: Window, key: Key[Array, ""]) -> tuple[Float[Array, ""], Metrics]:
         """The negative ELBO, mean over the valid moments after the burn-in."""
@@ -277,7 +268,7 @@ class VRMAgent:
         return state, self.batches(state, for_controller, key_belief), metrics
 
     def batches(self, state: State, windows: Window, key: Key[Array, ""]) -> Batch:
-        """The windows' transitions with their beliefs, split for the updates of a cycle: leaves (update, batch, ...)."""
+        """The windows' transitions with their beliefs, split for a cycle's updates: leaves (update, batch, ...)."""
         key_first, key_keep = jax.random.split(key)
         moments = _time_major(windows, 0, None)
         d_first = moments.note[0] if self.store_first_impression else self.states(state.first, moments, key_first)
@@ -313,7 +304,7 @@ class VRMAgent:
         gradient, metrics = gradients(
             state.controller, batch, noise, self.gamma, self.actor_regulariser, self.target_entropy
         )
-        controller, optimiser = descend(
+        controller, optimiser = update(
             self.optimisers, state.controller_optimiser, state.controller, gradient, self.tau
         )
         return state._replace(controller=controller, controller_optimiser=optimiser), metrics

@@ -10,7 +10,7 @@ COLOURS = {"sampled": "#1f6f8b", "mode": "#c8553d"}
 
 
 def evaluations(run: Run, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Steps (evaluation,) and each seed's mean (seed, evaluation) of an evaluation's entry, as far as all seeds have it."""
+    """Steps (evaluation,), and of an entry each seed's means (seed, evaluation), as far as all seeds have come."""
     seeds = [{row["step"]: float(np.mean(row[name])) for row in run.rows(seed, "evaluation")} for seed in run.seeds]
     steps = sorted(set.intersection(*map(set, seeds)))
     return np.array(steps), np.array([[seed[step] for step in steps] for seed in seeds]).reshape(len(seeds), -1)

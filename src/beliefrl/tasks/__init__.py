@@ -2,7 +2,6 @@
 
 import dataclasses
 import difflib
-from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 import jax.numpy as jnp
@@ -14,6 +13,7 @@ from beliefrl.tasks.target_reaching import TargetReaching
 from beliefrl.types import Spec, UserError
 
 
+@runtime_checkable
 @runtime_checkable
 class Task(Protocol):
     """A frozen dataclass of physical constants with pure methods; no time limit and no reset of its own.
@@ -43,7 +43,7 @@ class Task(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class Observed:
-    """A task of which only some entries of the observation are seen (Appendix B, "velocities only", "no velocities")."""
+    """A task of which only some entries of the observation are seen (Appendix B: velocities only, no velocities)."""
 
     task: Any
     indices: tuple[int, ...]
@@ -77,11 +77,13 @@ def observe(task: Task, indices: tuple[int, ...]) -> Observed:
     """
     size = task.spec.obs_dim
     if not indices or any(not 0 <= i < size for i in indices):
-        raise UserError(f"observe={tuple(indices)} does not fit an observation of {size}: give indices from 0 to {size - 1}.")
+        raise UserError(
+            f"observe={tuple(indices)} does not fit an observation of {size}: give indices from 0 to {size - 1}."
+        )
     return Observed(task, tuple(indices))
 
 
-TASKS: dict[str, Callable[..., Any]] = {
+TASKS: dict[str, type[Any]] = {
     "pendulum": Pendulum,
     "cartpole": CartPole,
     "target-reaching": TargetReaching,
@@ -119,7 +121,7 @@ def make(name: str, **constants: Any) -> Task:
         hint = f"did you mean {near[0]}?" if near else "`beliefrl tasks` lists them all."
         raise UserError(f"There is no task {name!r}: {hint}")
     base, mask = (name[:-2], name[-2:]) if name[-2:] in MASKS else (name, "")
-    fields = [field.name for field in dataclasses.fields(TASKS[base])]  # pyright: ignore[reportArgumentType]
+    fields = [field.name for field in dataclasses.fields(TASKS[base])]
     for constant in constants:
         if constant not in fields:
             raise UserError(f"The task {base} has no constant {constant!r}: it has {', '.join(fields)}.")
@@ -129,7 +131,7 @@ def make(name: str, **constants: Any) -> Task:
     return observe(task, task.VELOCITIES if mask == "-v" else task.POSITIONS)
 
 
-def describe(task: Task) -> dict[str, Any]:
+def describe(task: Any) -> dict[str, Any]:
     """{"task": the name for `make`, "constants": what it was made with}.
 
     A task that `make` cannot make is named module:Class, and has no constants.

@@ -1,8 +1,8 @@
 """CartPole with a continuous force: keep a pole upright on a cart (Gymnasium's physics; Appendix B).
 
-    temp = (F + m_p l θ̇² sin θ) / m,   F = 30 a,   m = m_c + m_p
-    θ̈ = (g sin θ - cos θ temp) / (l (4/3 - m_p cos² θ / m))
-    ẍ = temp - m_p l θ̈ cos θ / m,   all four integrated by Euler's explicit step
+temp = (F + m_p l θ̇² sin θ) / m,   F = 30 a,   m = m_c + m_p
+θ̈ = (g sin θ - cos θ temp) / (l (4/3 - m_p cos² θ / m))
+ẍ = temp - m_p l θ̈ cos θ / m,   all four integrated by Euler's explicit step
 """
 
 import dataclasses

@@ -1,7 +1,7 @@
 """Pendulum: swing a weight up and hold it there (Gymnasium's Pendulum-v1; Appendix B).
 
-    θ̈ = 3g / (2l) sin θ + 3 / (m l²) u,   u = 2 a,   θ = 0 upright
-    r = -(θ² + 0.1 θ̇² + 0.001 u²),   with θ wrapped to [-π, π)
+θ̈ = 3g / (2l) sin θ + 3 / (m l²) u,   u = 2 a,   θ = 0 upright
+r = -(θ² + 0.1 θ̇² + 0.001 u²),   with θ wrapped to [-π, π)
 """
 
 import dataclasses

@@ -70,8 +70,8 @@ class TargetReaching:
         return jax.lax.while_loop(too_close, redraw, redraw((key, jnp.zeros((3, 2)))))[1]
 
     def observation(self, state: TargetReachingState) -> Float[Array, "12"]:
-        """Nearness of red, green, blue; of the wall ahead and behind; sin and cos of the three bearings; last reward."""
-        offset = state.targets - state.position
+        """Nearness of red, green, blue, of the wall ahead and behind; sin and cos of the bearings; the last reward."""
+        offset = state.targets - state.position[None]
         distance = jnp.sqrt(jnp.sum(offset**2, axis=-1))
         bearing = jnp.arctan2(offset[:, 1], offset[:, 0]) - state.heading
         ahead = wall_distance(state.position, state.heading, self.field)
@@ -86,7 +86,7 @@ class TargetReaching:
             heading=jax.random.uniform(key_heading, (), maxval=2 * jnp.pi),
             targets=self.draw_targets(key_targets),
             reached=jnp.array(0),
-            reward=jnp.array(0.0),
+            reward=jnp.zeros(()),
         )
         return state, self.observation(state)
 

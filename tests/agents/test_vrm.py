@@ -1,0 +1,258 @@
+"""VRM: its tables, its gradients' reach, its beliefs in time."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from beliefrl import agents
+from beliefrl.agents.vrm import VRMAgent, _time_major
+from beliefrl.types import Spec, Step, UserError, Window
+from beliefrl.variational_model import VRM, Gaussian, Loop, LSTMState, _loop, _scan
+
+SMALL = {
+    "d_size": 8,
+    "z_size": 4,
+    "hidden_size": 8,
+    "policy_layers": (8, 8),
+    "value_layers": (8, 8),
+    "seq_len": 6,
+    "batch_size": 2,
+    "burn_in": 4,
+}
+SPEC = Spec(obs_dim=3, action_dim=2, max_steps=50)
+AGENT = VRMAgent(**SMALL)
+
+
+@pytest.fixture(scope="module")
+def state():
+    return jax.jit(lambda key: AGENT.init(key, SPEC))(jax.random.key(0))
+
+
+def windows(key, batch, is_first=None, exists=None):
+    """Random windows of the small agent's length, with random notes."""
+    time = AGENT.burn_in + AGENT.seq_len + 1
+    keys = jax.random.split(key, 4)
+    none = jnp.zeros((batch, time), bool)
+    step = Step(
+        jax.random.normal(keys[0], (batch, time, SPEC.obs_dim)),
+        jax.random.normal(keys[1], (batch, time)),
+        jnp.tanh(jax.random.normal(keys[2], (batch, time, SPEC.action_dim))),
+        none.at[:, 0].set(True) if is_first is None else is_first,
+        none,
+    )
+    note = (jax.random.normal(keys[3], (batch, time, AGENT.d_size)),)
+    return Window(step, note, ~none if exists is None else exists)
+
+
+def differ(a, b):
+    """Whether every array of two trees differs."""
+    return all(jax.tree.leaves(jax.tree.map(lambda x, y: bool(jnp.any(x != y)), a, b)))
+
+
+def same(a, b):
+    """Whether two trees are equal to the last bit."""
+    return all(jax.tree.leaves(jax.tree.map(lambda x, y: bool(jnp.all(x == y)), a, b)))
+
+
+def test_the_defaults_are_the_papers_tables():
+    table = {
+        "gamma": 0.99,
+        "step_start_rl": 1000,
+        "train_interval_rl": 1,
+        "lr_actor": 0.0003,
+        "lr_critic": 0.0003,
+        "lr_alpha": 0.0003,
+        "target_entropy": None,
+        "tau": 0.005,
+        "policy_layers": (256, 256),
+        "value_layers": (256, 256),
+        "train_times_fivrm": 5000,
+        "train_interval_klvrm": 5,
+        "lr_model": 0.0008,
+        "seq_len": 64,
+        "batch_size": 4,
+        "burn_in": 64,
+        "d_size": 256,
+        "z_size": 64,
+    }
+    settings = dataclasses.asdict(VRMAgent())
+    assert {name: settings[name] for name in table} == table
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"gamma": 1.5},
+        {"tau": -0.1},
+        {"seq_len": 0},
+        {"lr_model": float("nan")},
+        {"policy_layers": ()},
+        {"value_layers": (8, 0)},
+        {"train_interval_rl": 3},
+        {"elbo_scaling": "median"},
+        {"decode_from": "nowhere"},
+        {"no_such_thing": 1},
+    ],
+)
+def test_impossible_hyperparameters_are_refused_by_name(wrong):
+    with pytest.raises(UserError, match=next(iter(wrong))):
+        agents.make("vrm", **wrong)
+
+
+def test_the_controllers_gradient_never_reaches_the_models(state):
+    after, batches, _ = jax.jit(AGENT.begin_cycle)(state, windows(jax.random.key(1), 12), jax.random.key(2))
+    updated, _ = jax.jit(AGENT.update)(after, jax.tree.map(lambda leaf: leaf[0], batches), jax.random.key(3))
+    assert same(updated.first, after.first)
+    assert same(updated.keep, after.keep)
+    assert differ(updated.controller, after.controller)
+
+
+def test_a_cycle_trains_the_keep_learning_model_alone(state):
+    after, _, _ = jax.jit(AGENT.begin_cycle)(state, windows(jax.random.key(1), 12), jax.random.key(2))
+    assert same(after.first, state.first)
+    assert same(after.controller, state.controller)
+    assert differ(after.keep, state.keep)
+
+
+def test_pretraining_trains_the_first_impression_model_alone(state):
+    after, _ = jax.jit(AGENT.pretrain)(state, windows(jax.random.key(1), 2), jax.random.key(2))
+    assert differ(after.first, state.first)
+    assert same((after.keep, after.controller), (state.keep, state.controller))
+
+
+def infer(vrm, window, noise):
+    moments = _time_major(window, 0, None)
+    x = jnp.concatenate([moments.step.obs, moments.step.reward[..., None]], axis=-1)
+    return vrm.infer(vrm.start(noise.shape[1]), x, moments.step.prev_action, moments.step.is_first, noise)
+
+
+def test_an_episode_inside_a_window_begins_with_an_empty_memory(state):
+    window = windows(jax.random.key(1), 1)
+    two = window._replace(step=window.step._replace(is_first=window.step.is_first.at[0, 5].set(True)))
+    noise = jax.random.normal(jax.random.key(2), (11, 1, AGENT.z_size))
+    whole = infer(state.keep, two, noise)
+    second = infer(state.keep, jax.tree.map(lambda leaf: leaf[:, 5:], two), noise[5:])
+    np.testing.assert_allclose(whole.state.d[5:], second.state.d, rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(whole.before[5], 0)
+    assert not np.allclose(infer(state.keep, window, noise).state.d[5], whole.state.d[5])
+
+
+def test_the_burn_in_and_the_sequence_are_one_unroll(state):
+    window = windows(jax.random.key(1), 3)
+    noise = jax.random.normal(jax.random.key(2), (11, 3, AGENT.z_size))
+    moments = _time_major(window, 0, None)
+    x = jnp.concatenate([moments.step.obs, moments.step.reward[..., None]], axis=-1)
+    whole = infer(state.keep, window, noise)
+    start = jax.tree.map(lambda leaf: leaf[3], whole.state)
+    rest = state.keep.infer(start, x[4:], moments.step.prev_action[4:], moments.step.is_first[4:], noise[4:])
+    np.testing.assert_allclose(rest.state.d, whole.state.d[4:], rtol=1e-5, atol=1e-6)
+
+
+def test_acting_forms_the_belief_that_replay_forms(state):
+    """Moment by moment as an actor and at once as the replay: the same d, with the same z."""
+    window = windows(jax.random.key(1), 1)
+    at_once = infer(state.keep, window, jnp.zeros((11, 1, AGENT.z_size)))
+    memory, mode = AGENT.reset(), jnp.array(False)
+    for t in range(11):
+        step = jax.tree.map(lambda leaf, t=t: leaf[0, t], window.step)
+        _, memory = AGENT.act(state, memory, step, jax.random.key(t), mode)
+        np.testing.assert_allclose(memory.keep.d, at_once.state.d[t, 0], rtol=1e-5, atol=1e-6)
+
+
+def test_mode_actions_are_deterministic_and_samples_are_not(state):
+    step = jax.tree.map(lambda leaf: leaf[0, 0], windows(jax.random.key(1), 1).step)
+    actions = {
+        mode: [AGENT.act(state, AGENT.reset(), step, jax.random.key(k), jnp.array(mode))[0] for k in (1, 2)]
+        for mode in (False, True)
+    }
+    np.testing.assert_array_equal(*actions[False])
+    assert differ(*actions[True])
+
+
+def test_batches_are_aligned_in_time(state):
+    """Transition t: belief of t, action and reward that came with t+1, belief of t+1."""
+    window = windows(jax.random.key(1), 10)
+    batch = jax.jit(AGENT.batches)(state, window, jax.random.key(2))
+    assert batch.belief.shape == (5, 12, 2 * AGENT.d_size + 4)
+    for update, t, sequence in ((0, 0, 0), (3, 2, 1), (4, 5, 1)):
+        row, source, now = t * 2 + sequence, update * 2 + sequence, AGENT.burn_in + t
+        picked = jax.tree.map(lambda leaf, update=update, row=row: leaf[update, row], batch)
+        step = jax.tree.map(lambda leaf, source=source: leaf[source], window.step)
+        np.testing.assert_array_equal(picked.belief[: AGENT.d_size], window.note[0][source, now])
+        np.testing.assert_array_equal(picked.next_belief[: AGENT.d_size], window.note[0][source, now + 1])
+        np.testing.assert_array_equal(picked.belief[-4:], [*step.obs[now], step.reward[now]])
+        np.testing.assert_array_equal(picked.next_belief[-4:], [*step.obs[now + 1], step.reward[now + 1]])
+        np.testing.assert_array_equal(picked.action, step.prev_action[now + 1])
+        assert picked.reward == step.reward[now + 1]
+
+
+def test_moments_that_do_not_exist_enter_no_loss(state):
+    exists = jnp.ones((12, 11), bool).at[:, 8:].set(False)
+    here = windows(jax.random.key(1), 12, exists=exists)
+    other = windows(jax.random.key(9), 12, exists=exists)
+    there = jax.tree.map(lambda a, b: jnp.where(exists.reshape(exists.shape + (1,) * (a.ndim - 2)), a, b), here, other)
+    results = []
+    for window in (here, there):
+        after, batches, metrics = jax.jit(AGENT.begin_cycle)(state, window, jax.random.key(2))
+        for number in range(2):
+            after, more = jax.jit(AGENT.update)(
+                after, jax.tree.map(lambda leaf, number=number: leaf[number], batches), jax.random.key(number)
+            )
+            metrics |= more
+        results.append((after, metrics))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7), *results)
+
+
+def test_a_recomputed_first_impression_is_the_stored_one_up_to_its_sample(state):
+    """With notes that the model itself made, both ways of forming beliefs agree on everything but the draw of z."""
+    recompute = dataclasses.replace(AGENT, store_first_impression=False)
+    window = windows(jax.random.key(1), 10)
+    key_first, _ = jax.random.split(jax.random.key(2))
+    moments = _time_major(window, 0, None)
+    d_first = AGENT.states(state.first, moments, key_first)
+    stored = AGENT.batches(state, window._replace(note=(d_first.swapaxes(0, 1),)), jax.random.key(2))
+    again = recompute.batches(state, window._replace(note=()), jax.random.key(2))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), stored, again)
+
+
+def test_decoding_from_the_prior_and_sums_are_other_losses(state):
+    window = windows(jax.random.key(1), 2)
+    loss = {
+        options: dataclasses.replace(AGENT, decode_from=options[0], elbo_scaling=options[1]).model_loss(
+            state.keep, window, jax.random.key(2)
+        )[1]
+        for options in (("posterior", "mean"), ("prior", "mean"), ("posterior", "sum"))
+    }
+    mean, prior, total = loss.values()
+    assert float(prior["kl"]) == pytest.approx(float(mean["kl"]), rel=1e-5)
+    assert float(prior["log_likelihood"]) != pytest.approx(float(mean["log_likelihood"]), rel=1e-3)
+    assert float(total["kl"]) == pytest.approx(float(mean["kl"]) * AGENT.z_size, rel=1e-4)
+    assert float(total["log_likelihood"]) == pytest.approx(float(mean["log_likelihood"]) * 4, rel=1e-4)
+
+
+def test_the_loops_gradient_is_that_of_plain_differentiation():
+    vrm = VRM(4, 2, 8, 4, 8, jax.random.key(0))
+    weights = Loop(vrm.joint.by_d, vrm.joint.by_z, vrm.posterior_mean, vrm.posterior_sigma)
+    start = LSTMState(*jax.random.normal(jax.random.key(1), (2, 3, 8)))
+    given = jax.random.normal(jax.random.key(2), (5, 3, 2 * 8 + 4 * 8))
+    is_first = jnp.zeros((5, 3), bool).at[2, 1].set(True)
+    noise = jax.random.normal(jax.random.key(3), (5, 3, 4))
+
+    def probe(inferred):
+        leaves = jax.tree.leaves(inferred)
+        return sum(jnp.sum(leaf * jax.random.normal(jax.random.key(i), leaf.shape)) for i, leaf in enumerate(leaves))
+
+    def plain(*args):
+        return _scan(*args[:3], Gaussian(jnp.zeros_like(noise), jnp.zeros_like(noise)), is_first, noise)[0]
+
+    def ours(*args):
+        return _loop(*args, is_first, noise)
+
+    gradients = [
+        jax.jit(jax.grad(lambda *args, f=f: probe(f(*args)), argnums=(0, 1, 2)))(weights, start, given)
+        for f in (ours, plain)
+    ]
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), *gradients)
