@@ -27,7 +27,7 @@ def net(numbers, name, activation):
     """The weights `name` of a golden file as an MLP."""
     count = sum(key.startswith(f"{name}/") and key.endswith("weight") for key in numbers)
     sizes = [numbers[f"{name}/0/weight"].shape[1]] + [numbers[f"{name}/{i}/weight"].shape[0] for i in range(count)]
-    mlp = MLP(sizes, activation, jax.random.key(0))
+    mlp = MLP(sizes, activation)
     layers = tuple(
         eqx.tree_at(
             lambda layer: (layer.weight, layer.bias),
@@ -46,7 +46,7 @@ def with_weights(part, group):
 
 def vrm_from(numbers):
     """A VRM whose weights (or whose gradient) are the golden ones; the two LSTM biases become one."""
-    vrm = VRM(X, ACTION, D, Z, HIDDEN, jax.random.key(0))
+    vrm = VRM(X, ACTION, D, Z, HIDDEN)
     mean, sigma = net(numbers, "posterior_mean", jnp.tanh), net(numbers, "posterior_sigma", jnp.tanh)
     posterior = np.concatenate([mean.layers[0].weight, sigma.layers[0].weight]).T  # rows d, action, features
     w_ih, w_hh = numbers["lstm/weight_ih"].T, numbers["lstm/weight_hh"].T  # rows features, z
@@ -139,7 +139,7 @@ def sac_numbers():
 
 
 def controller_from(numbers, log_alpha):
-    actor = Actor(39, 3, (8, 8), jax.random.key(0))
+    actor = Actor(39, 3, (8, 8))
     networks = {name: net(numbers, name, jax.nn.relu) for name in ("mean", "log_sigma", "value", "q1", "q2")}
     actor = eqx.tree_at(lambda actor: (actor.mean, actor.log_sigma), actor, (networks["mean"], networks["log_sigma"]))
     target = net(numbers, "target_value", jax.nn.relu) if "target_value/0/weight" in numbers else networks["value"]

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from beliefrl.nets import MLP, gaussian_kl, gaussian_log_prob, lstm_state, tanh_gaussian
+from beliefrl.nets import MLP, draw, gaussian_kl, gaussian_log_prob, lstm_state, tanh_gaussian
 
 
 def sigmoid(x):
@@ -60,7 +60,7 @@ def test_log_prob_stays_finite_where_tanh_saturates():
 
 
 def test_layers_start_in_pytorchs_bounds():
-    mlp = MLP((50, 400, 3), jnp.tanh, jax.random.key(0))
+    mlp = draw(jax.random.key(0), MLP((50, 400, 3), jnp.tanh))
     for layer, fan_in in zip(mlp.layers, (50, 400), strict=True):
         for leaf in (layer.weight, layer.bias):
             assert float(jnp.abs(leaf).max()) <= fan_in**-0.5
@@ -68,5 +68,5 @@ def test_layers_start_in_pytorchs_bounds():
 
 
 def test_rest_continues_from_the_first_layer():
-    mlp, x = MLP((3, 8, 8, 2), jnp.tanh, jax.random.key(0)), jnp.arange(3.0)
+    mlp, x = draw(jax.random.key(0), MLP((3, 8, 8, 2), jnp.tanh)), jnp.arange(3.0)
     np.testing.assert_array_equal(mlp(x), mlp.rest(mlp.layers[0](x)))

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Key
 from beliefrl import phases
 from beliefrl import replay as ring
 from beliefrl.agents import Agent
-from beliefrl.types import Spec, UserError
+from beliefrl.types import Spec, UserError, check_range
 
 PAPER_STEPS = 100_000  # of the wall-clock times in the paper's scalability table
 REPEATS = 9
@@ -33,8 +33,7 @@ class Noise:
     action_dim: int
 
     def __post_init__(self) -> None:
-        if self.obs_dim < 1 or self.action_dim < 1:
-            raise UserError(f"obs={self.obs_dim}, actions={self.action_dim} is impossible: both must be at least 1.")
+        check_range(self, ("obs_dim", "action_dim"), 1)
 
     @property
     def spec(self) -> Spec:
@@ -81,7 +80,7 @@ class _Timed:
 
     def __init__(self, agent: Agent, task: Noise, seeds: int):
         self.agent, self.step = agent, 0
-        self.program = phases.compile_program(agent, task, capacity=2 * PAPER_STEPS // max(seeds, 1) + 2, episodes=1)
+        self.program = phases.compile_program(agent, task, capacity=2 * PAPER_STEPS // seeds + 2, episodes=1)
         self.keys = jax.random.split(jax.random.key(0), seeds)
         self.seeds = jax.block_until_ready(self.program.begin(self.keys))
 
@@ -117,6 +116,8 @@ def bench(agent: Agent, obs: int, actions: int, seeds: int = 1, started: float |
         cycle of learning, exploration and pre-training cut to one stretch); compile_s, its part that is compilation;
         matmul_gflops, gflop_per_step, share_of_peak; parameters of one seed; obs, actions, seeds.
     """
+    if not 1 <= seeds <= 2 * PAPER_STEPS:
+        raise UserError(f"seeds={seeds} is impossible: it must be from 1 to {2 * PAPER_STEPS}.")
     started = time.time() if started is None else started
     stretch = phases.stretch_length(agent)
     cycles = stretch // agent.cycle

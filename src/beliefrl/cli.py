@@ -167,8 +167,6 @@ def bench(argv: Sequence[str]) -> None:
     options = _parse(_agent_options(agents.find(name), own), rest, f"beliefrl bench {name}")
     from beliefrl.bench import bench as run_bench
 
-    if options.seeds < 1:
-        raise UsageError(f"seeds={options.seeds} is impossible: it must be at least 1.")
     result = run_bench(options.agent, options.obs, options.actions, options.seeds, STARTED)
     if options.json:
         print(json.dumps(result))
@@ -219,17 +217,24 @@ def _parse(options: Any, argv: Sequence[str], prog: str) -> Any:
     return parsed
 
 
+WORDING = (  # tyro's, Python's, and ours
+    (r"Missing from .*: (\w+) .*", r"\1 is missing"),
+    (r"Error parsing (\S+): invalid literal for int\(\) with base 10: (.*)", r"\1 must be a whole number, not \2"),
+    (r"Error parsing (\S+): could not convert string to float: (.*)", r"\1 must be a number, not \2"),
+    (r"Error parsing (\S+): .* \[(.*)\]", r"\1 cannot be \2"),
+    (r"invalid choice (.*) for argument '(\S+)'. Expected one of \((.*)\)", r"\2 must be one of \3, not \1"),
+    (r"Missing value for argument '(\S+)'.*", r"\1 needs a value"),
+)
+
+
 def _sentence(box: str) -> str:
-    """The message in a box that tyro drew, on one line."""
-    lines = [
-        re.sub(r"^[│|]\s?|\s*[│|]$", "", line).strip() for line in box.splitlines() if not line.startswith(("╭", "╰"))
-    ]
-    message = []
-    for line in lines:
-        if line.startswith("─"):
-            break
-        message.append(line)
-    return re.sub(r"\s+", " ", " ".join(message)).rstrip(".") or "That command line cannot be understood"
+    """The first paragraph below the title of a box that tyro drew, on one line and in our words."""
+    lines = [line.strip(" │|╭╮╰╯─-") for line in box.splitlines()[1:]]  # rules become empty
+    paragraphs = " ".join(line or "\n" for line in lines).split("\n")
+    message = next(filter(str.strip, paragraphs), "That command line cannot be understood").strip().rstrip(".")
+    for theirs, ours in WORDING:
+        message = re.sub(f"^{theirs}$", ours, message)
+    return message
 
 
 def _unknown(options: Any, given: str, prog: str) -> str:
@@ -252,7 +257,7 @@ def _option_names(options: Any) -> list[str]:
 
 
 def _fail(message: str) -> NoReturn:
-    print(f"beliefrl: {message}", file=sys.stderr)
+    print("beliefrl:", " ".join(message.split()), file=sys.stderr)
     raise SystemExit(2)
 
 
@@ -283,6 +288,10 @@ def main(argv: Sequence[str] | None = None) -> None:
         raise SystemExit(130) from None
     except BrokenPipeError:
         raise SystemExit(0) from None
+    except Exception as error:
+        if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
+            _fail("There is not enough memory for this: lower the sizes, the seeds, the episodes or the replay.")
+        raise
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """What a trained agent is worth: returns over episodes and seeds, with sampled and with mode actions."""
 
+import os
 from typing import Any
 
 import jax
@@ -11,7 +12,7 @@ from beliefrl.phases import evaluate as evaluate_seed
 from beliefrl.rollout import Episode
 from beliefrl.runs import Run
 from beliefrl.tasks import Task
-from beliefrl.types import UserError
+from beliefrl.types import LARGEST, UserError
 
 MODES = ("sampled", "mode")  # how actions are chosen; the first axis of an evaluation's leaves behind seeds
 
@@ -62,7 +63,9 @@ def _tuples(values: dict[str, Any]) -> dict[str, Any]:
     return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
 
 
-def evaluate(run: Run | str, episodes: int = 20, seed: int = 0, task: Task | None = None) -> dict[str, Any]:
+def evaluate(
+    run: Run | str | os.PathLike[str], episodes: int = 20, seed: int = 0, task: Task | None = None
+) -> dict[str, Any]:
     """Let the trained agents of a run play `episodes` new episodes, once with sampled and once with mode actions.
 
     Args:
@@ -76,10 +79,12 @@ def evaluate(run: Run | str, episodes: int = 20, seed: int = 0, task: Task | Non
         undiscounted; "sem" is over seeds and None with one; success is a rate in [0, 1], None where a task has none.
 
     Raises:
-        UserError: there is no such run, nothing was saved in it, or `episodes` is below 1.
+        UserError: there is no such run, nothing was saved in it, or a number is impossible.
     """
-    if episodes < 1:
-        raise UserError(f"episodes={episodes} is impossible: it must be at least 1.")
+    if not 1 <= episodes <= LARGEST // 2:
+        raise UserError(f"episodes={episodes} is impossible: it must be from 1 to {LARGEST // 2}.")
+    if not 0 <= seed <= LARGEST:
+        raise UserError(f"seed={seed} is impossible: it must be from 0 to {LARGEST}.")
     run = run if isinstance(run, Run) else Run(run)
     agent, task, states = restore(run, task)
     keys = jax.random.split(jax.random.key(seed), len(run.seeds))

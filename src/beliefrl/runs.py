@@ -42,7 +42,7 @@ class Run:
             UserError: it does not exist, or no training made it.
         """
         self.folder = pathlib.Path(folder)
-        if not self.folder.is_dir():
+        if not os.path.isdir(self.folder):  # pathlib's raises where a name is too long
             raise UserError(f"There is no run folder {self.folder}: give the --out of a training.")
         path = self.folder / "config.json"
         try:
@@ -53,6 +53,8 @@ class Run:
             ) from None
         except (OSError, ValueError):
             raise UserError(f"{path} cannot be read as JSON: restore it, or train again.") from None
+        if not _is_complete(self.config):
+            raise UserError(f"{path} lacks what a training writes there: restore it, or train again.")
 
     @property
     def seeds(self) -> list[int]:
@@ -110,11 +112,12 @@ class Recorder(Run):
             UserError: it exists already, or cannot be made.
         """
         folder = pathlib.Path(folder)
-        if folder.exists():
-            raise UserError(f"{folder} exists already: choose another --out, or remove it.")
         try:
-            (folder / "metrics").mkdir(parents=True)
+            folder.mkdir(parents=True)
+            (folder / "metrics").mkdir()
             write_whole(folder / "config.json", (json.dumps(config, indent=2) + "\n").encode())
+        except FileExistsError:
+            raise UserError(f"{folder} exists already: choose another --out.") from None
         except OSError as error:
             raise UserError(
                 f"The run folder {folder} cannot be made ({error.strerror}): choose another --out."
@@ -152,6 +155,14 @@ class Recorder(Run):
         """Close the logs."""
         for writer in (*self._lines.values(), *self._events.values()):
             writer.close()
+
+
+def _is_complete(config: Any) -> bool:
+    """Whether a config.json holds what is read from it."""
+    kinds = {"agent": str, "hyperparameters": dict, "task": str, "constants": dict, "options": dict}
+    if not isinstance(config, dict) or not all(isinstance(config.get(key), kind) for key, kind in kinds.items()):
+        return False
+    return all(isinstance(config["options"].get(key), int) for key in ("seed", "seeds"))
 
 
 def write_whole(path: pathlib.Path, content: bytes) -> None:

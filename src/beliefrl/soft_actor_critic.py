@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.nets import MLP, descend, tanh_gaussian
+from beliefrl.nets import MLP, descend, draw, tanh_gaussian
 
 LOG_SIGMA_MIN, LOG_SIGMA_MAX = -20.0, 2.0
 
@@ -31,10 +31,9 @@ class Actor(eqx.Module):
     mean: MLP
     log_sigma: MLP
 
-    def __init__(self, belief: int, action: int, layers: tuple[int, ...], key: Key[Array, ""]):
-        key_mean, key_sigma = jax.random.split(key)
-        self.mean = MLP((belief, *layers, action), jax.nn.relu, key_mean)
-        self.log_sigma = MLP((belief, *layers, action), jax.nn.relu, key_sigma)
+    def __init__(self, belief: int, action: int, layers: tuple[int, ...]):
+        self.mean = MLP((belief, *layers, action), jax.nn.relu)
+        self.log_sigma = MLP((belief, *layers, action), jax.nn.relu)
 
     def __call__(self, belief: Float[Array, " belief"]) -> tuple[Float[Array, " action"], Float[Array, " action"]]:
         """μ and log σ before the tanh, log σ clipped to [-20, 2]."""
@@ -84,14 +83,11 @@ def init_controller(
     belief: int, action: int, policy_layers: tuple[int, ...], value_layers: tuple[int, ...], key: Key[Array, ""]
 ) -> Controller:
     """A new controller for beliefs and actions of these sizes; V̄ starts as V, log α at 0."""
-    key_actor, key_value, key_q1, key_q2 = jax.random.split(key, 4)
-    value = MLP((belief, *value_layers, 1), jax.nn.relu, key_value)
-    critics = (
-        MLP((belief + action, *value_layers, 1), jax.nn.relu, key_q1),
-        MLP((belief + action, *value_layers, 1), jax.nn.relu, key_q2),
-    )
-    target = jax.tree.map(jnp.copy, value)
-    return Controller(Actor(belief, action, policy_layers, key_actor), critics, value, target, jnp.zeros(()))
+    critic = MLP((belief + action, *value_layers, 1), jax.nn.relu)
+    value = MLP((belief, *value_layers, 1), jax.nn.relu)
+    bounds = Controller(Actor(belief, action, policy_layers), (critic, critic), value, value, jnp.zeros(()))
+    controller = draw(key, bounds)
+    return controller._replace(target_value=jax.tree.map(jnp.copy, controller.value))
 
 
 def valid_mean(x: Float[Array, " batch"], valid: Bool[Array, " batch"]) -> Float[Array, ""]:

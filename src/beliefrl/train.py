@@ -42,8 +42,9 @@ class Options:
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
-        check_range(self, ("steps", "seeds", "eval_every", "eval_episodes", "replay_capacity"), 1)
-        check_range(self, ("seed",), 0, 2**31 - 1)
+        check_range(self, ("steps", "eval_every", "eval_episodes", "replay_capacity"), 1)
+        check_range(self, ("seeds",), 1, 10_000)
+        check_range(self, ("seed",), 0, 2_000_000_000)
 
 
 class Event(NamedTuple):
@@ -61,10 +62,7 @@ class Event(NamedTuple):
 def stages(agent: Agent, task: Task, options: Options) -> Iterator[Event]:
     """Train; yields an Event before whatever takes long and after whatever gave something to tell."""
     start = min(agent.step_start_rl, options.steps)
-    capacity = min(options.replay_capacity, 2 * options.steps)  # a moment a step, and one more where an episode ends
-    if options.steps > start and capacity < min(2 * start, agent.window.length + 1):
-        raise UserError(f"replay_capacity={options.replay_capacity} is too small for step_start_rl={start}: raise it.")
-    program = phases.compile_program(agent, task, capacity, options.eval_episodes)
+    program = phases.compile_program(agent, task, _capacity(agent, options), options.eval_episodes)
     keys = jax.vmap(jax.random.key)(np.arange(options.seed, options.seed + options.seeds))
     stretch = phases.stretch_length(agent)
 
@@ -99,6 +97,15 @@ def stages(agent: Agent, task: Task, options: Options) -> Iterator[Event]:
             yield from _evaluation(program, seeds, evaluated := step)
     if evaluated < step:
         yield from _evaluation(program, seeds, step)
+
+
+def _capacity(agent: Agent, options: Options) -> int:
+    """Moments in a seed's replay: no more than can come, a moment a step and one more where an episode ends."""
+    start = min(agent.step_start_rl, options.steps)
+    needed = min(2 * start, agent.window.length + 1) if options.steps > start else 1
+    if options.replay_capacity < needed:
+        raise UserError(f"replay_capacity={options.replay_capacity} is too small: this agent needs at least {needed}.")
+    return min(options.replay_capacity, 2 * options.steps)
 
 
 def _until(step: int, every: int) -> int:
@@ -142,6 +149,7 @@ def train(
         if name not in known:
             raise UserError(f"Training has no option {name!r}: it has {', '.join(known)}.")
     chosen = Options(**options)
+    _capacity(agent, chosen)  # complains before there is a folder
     config = {
         "agent": agents.name_of(agent),
         "hyperparameters": dataclasses.asdict(agent),  # pyright: ignore[reportArgumentType]

@@ -4,7 +4,8 @@ Axis names in shapes, everywhere: `seed` (one training each), `batch` (windows),
 `obs`, `action`, `belief` (what the controller reads), `d` (recurrent state), `z` (latent variable), `x` (perception).
 """
 
-import math
+import dataclasses
+import numbers
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -15,14 +16,25 @@ class UserError(Exception):
     """A mistake that the user can mend. Its message is one sentence: what was wrong, and what to do."""
 
 
-def check_range(settings: object, names: Sequence[str], low: int, high: int | float = math.inf) -> None:
-    """Raise a UserError where a field of `settings`, or an entry of a tuple there, is not in [low, high]."""
+LARGEST = 2**31 - 1  # integer in a compiled program
+
+
+def check_range(settings: Any, names: Sequence[str], low: int, high: int = LARGEST) -> None:
+    """Raise a UserError where a field of a dataclass, or an entry of a tuple there, is no number in [low, high].
+
+    Where the field is declared as int, it must be a whole number. NaN is in no range.
+    """
+    declared = {field.name: field.type for field in dataclasses.fields(settings)}
     for name in names:
         value = getattr(settings, name)
         entries = value if isinstance(value, tuple) else (value,)
-        if not entries or not all(low <= entry <= high for entry in entries):
-            bounds = f"at least {low:g}" if high == math.inf else f"from {low:g} to {high:g}"
-            raise UserError(f"{name}={value} is impossible: it must be {bounds}.")
+        whole = declared[name] in (int, tuple[int, ...])
+        kind = numbers.Integral if whole else numbers.Real
+        if not entries or not all(isinstance(entry, kind) and low <= entry <= high for entry in entries):
+            too_large = any(isinstance(entry, kind) and entry > high for entry in entries)
+            bounds = f"from {low} to {high}" if too_large or high < LARGEST else f"of at least {low}"
+            number = "a whole number" if whole else "a number"
+            raise UserError(f"{name}={value} is impossible: it must be {number} {bounds}.")
 
 
 def check_choice(settings: object, name: str, choices: Sequence[str]) -> None:

@@ -21,9 +21,9 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float
 
-from beliefrl.nets import MLP, gaussian_kl, gaussian_log_prob, lstm_state
+from beliefrl.nets import MLP, Linear, gaussian_kl, gaussian_log_prob, lstm_state
 
 SIGMA_X_MIN = 1e-3
 
@@ -61,19 +61,13 @@ class Joint(eqx.Module):
     by_z: Float[Array, "z 4*d"]  # the gates alone
     bias: Float[Array, " joint"]
 
-    def __init__(self, action: int, d: int, z: int, hidden: int, key: Key[Array, ""]):
+    def __init__(self, action: int, d: int, z: int, hidden: int):
         posterior, gates = (d + action + hidden) ** -0.5, d**-0.5  # PyTorch's bounds for a linear layer and an LSTM
-        bound = jnp.concatenate([jnp.full(2 * hidden, posterior), jnp.full(4 * d, gates)])
-
-        def uniform(key, rows, bound):
-            return jax.random.uniform(key, (rows, bound.size), minval=-1.0) * bound[None]
-
-        keys = jax.random.split(key, 5)
-        self.by_d = uniform(keys[0], d, bound)
-        self.by_features = uniform(keys[1], hidden, bound)
-        self.by_action = uniform(keys[2], action, bound[: 2 * hidden])
-        self.by_z = uniform(keys[3], z, bound[2 * hidden :])
-        self.bias = uniform(keys[4], 1, bound)[0]
+        self.bias = jnp.concatenate([jnp.full(2 * hidden, posterior), jnp.full(4 * d, gates)])
+        self.by_d = jnp.tile(self.bias, (d, 1))
+        self.by_features = jnp.tile(self.bias, (hidden, 1))
+        self.by_action = jnp.full((action, 2 * hidden), posterior)
+        self.by_z = jnp.full((z, 4 * d), gates)
 
     def given(
         self, features: Float[Array, "time batch hidden"], prev_action: Float[Array, "time batch action"]
@@ -90,28 +84,24 @@ class VRM(eqx.Module):
 
     features: MLP  # f_x
     joint: Joint
-    posterior_mean: eqx.nn.Linear  # last layers of μ_q and σ_q
-    posterior_sigma: eqx.nn.Linear
+    posterior_mean: Linear  # last layers of μ_q and σ_q
+    posterior_sigma: Linear
     prior_mean: MLP
     prior_sigma: MLP
     decoder_mean: MLP
     decoder_sigma: MLP
 
-    def __init__(self, x: int, action: int, d: int, z: int, hidden: int, key: Key[Array, ""]):
+    def __init__(self, x: int, action: int, d: int, z: int, hidden: int):
         """Widths: perception (observation and reward), action, d, z, and every hidden layer."""
-        keys = iter(jax.random.split(key, 8))
 
         def net(*sizes: int) -> MLP:
-            return MLP(sizes, jnp.tanh, next(keys))
+            return MLP(sizes, jnp.tanh)
 
         self.features = net(x, hidden, hidden)
-        self.joint = Joint(action, d, z, hidden, next(keys))
-        self.posterior_mean = eqx.nn.Linear(hidden, z, key=next(keys))
-        self.posterior_sigma = eqx.nn.Linear(hidden, z, key=next(keys))
-        self.prior_mean = net(d + action, hidden, z)
-        self.prior_sigma = net(d + action, hidden, z)
-        self.decoder_mean = net(d + z, hidden, hidden, x)
-        self.decoder_sigma = net(d + z, hidden, hidden, x)
+        self.joint = Joint(action, d, z, hidden)
+        self.posterior_mean, self.posterior_sigma = Linear(hidden, z), Linear(hidden, z)
+        self.prior_mean, self.prior_sigma = net(d + action, hidden, z), net(d + action, hidden, z)
+        self.decoder_mean, self.decoder_sigma = net(d + z, hidden, hidden, x), net(d + z, hidden, hidden, x)
 
     def start(self, batch: int) -> LSTMState:
         """The state in which episodes begin."""
@@ -175,8 +165,8 @@ class Loop(NamedTuple):
 
     by_d: Float[Array, "d joint"]
     by_z: Float[Array, "z 4*d"]
-    mean: eqx.nn.Linear
-    sigma: eqx.nn.Linear
+    mean: Linear
+    sigma: Linear
 
 
 class Hidden(NamedTuple):
@@ -190,7 +180,7 @@ def _cell(weights, state, given, zero, is_first, noise):
     """One step. `zero` is added to the outputs of the posterior's last layers: its cotangent is theirs."""
     before = jax.tree.map(lambda leaf: jnp.where(is_first[:, None], 0.0, leaf), state)
     pre = given + before.d @ weights.by_d
-    hidden = weights.mean.in_features
+    hidden = weights.mean.weight.shape[1]
     first = jnp.tanh(pre[:, : 2 * hidden])
     hidden_mean, hidden_sigma = first[:, :hidden], first[:, hidden:]
     mean = jax.vmap(weights.mean)(hidden_mean) + zero.mean

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.nets import descend, tanh_gaussian
+from beliefrl.nets import descend, draw, tanh_gaussian
 from beliefrl.soft_actor_critic import (
     Batch,
     Controller,
@@ -166,13 +166,10 @@ class VRMAgent:
         return optax.adam(self.lr_model)
 
     def init(self, key: Key[Array, ""], spec: Spec) -> State:
-        key_first, key_keep, key_controller = jax.random.split(key, 3)
+        key_models, key_controller = jax.random.split(key)
         x = spec.obs_dim + 1
-
-        def model(key: Key[Array, ""]) -> VRM:
-            return VRM(x, spec.action_dim, self.d_size, self.z_size, self.hidden_size, key)
-
-        first, keep = model(key_first), model(key_keep)
+        bounds = VRM(x, spec.action_dim, self.d_size, self.z_size, self.hidden_size)
+        first, keep = draw(key_models, (bounds, bounds))
         controller = init_controller(
             2 * self.d_size + x, spec.action_dim, self.policy_layers, self.value_layers, key_controller
         )
@@ -242,7 +239,7 @@ class VRMAgent:
         inferred = vrm.infer(start, *inputs, after.step.is_first, noise)
         prior_noise = self.noise(key_prior, after) if self.decode_from == "prior" else None
         terms = elbo_terms(vrm, inferred, *inputs, self.elbo_scaling, prior_noise)
-        kl, log_likelihood = (valid_mean(term, after.exists) for term in terms)
+        kl, log_likelihood = (valid_mean(term.ravel(), after.exists.ravel()) for term in terms)
         return kl - log_likelihood, {"kl": kl, "log_likelihood": log_likelihood, "negative_elbo": kl - log_likelihood}
 
     def unroll(self, vrm: VRM, windows: Window, key: Key[Array, ""]) -> LSTMState:

@@ -5,6 +5,7 @@ import pathlib
 import numpy as np
 
 from beliefrl.runs import Run
+from beliefrl.types import UserError
 
 COLOURS = {"sampled": "#1f6f8b", "mode": "#c8553d"}
 
@@ -27,14 +28,19 @@ def draw_curve(run: Run, path: pathlib.Path | str | None = None) -> pathlib.Path
     """Draw a run's evaluations, with a second panel for success where its task has one; returns the picture's path.
 
     `path` is the run's curve.png if not given. One thin line a seed, a thick one and a band for mean and S.E.M.
+
+    Raises:
+        UserError: there is no evaluation yet.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # no display, no global state
     from matplotlib.figure import Figure
 
     path = pathlib.Path(path or run.folder / "curve.png")
-    rows = list(run.rows(run.seeds[0], "evaluation"))
+    rows = [list(run.rows(seed, "evaluation")) for seed in run.seeds]
+    if not all(rows):
+        raise UserError(f"{run.folder} has no evaluation of every seed yet: there is no curve to draw.")
     panels = [("return", "")]
-    if rows and "sampled_success" in rows[0]:
+    if "sampled_success" in rows[0][0]:
         panels.append(("success rate", "_success"))
 
     figure = Figure(figsize=(5.6 * len(panels), 3.6), layout="constrained")
