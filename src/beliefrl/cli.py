@@ -289,7 +289,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     except BrokenPipeError:
         raise SystemExit(0) from None
     except Exception as error:
-        if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
+        if isinstance(error, MemoryError | OverflowError) or "out of memory" in str(error).lower():
             _fail("There is not enough memory for this: lower the sizes, the seeds, the episodes or the replay.")
         raise
 

@@ -15,6 +15,7 @@ from beliefrl.tasks import Task
 from beliefrl.types import LARGEST, UserError
 
 MODES = ("sampled", "mode")  # how actions are chosen; the first axis of an evaluation's leaves behind seeds
+MOST_EPISODES = 100_000  # side by side
 
 
 def summary(result: Episode, has_success: bool) -> dict[str, Any]:
@@ -81,8 +82,8 @@ def evaluate(
     Raises:
         UserError: there is no such run, nothing was saved in it, or a number is impossible.
     """
-    if not 1 <= episodes <= LARGEST // 2:
-        raise UserError(f"episodes={episodes} is impossible: it must be from 1 to {LARGEST // 2}.")
+    if not 1 <= episodes <= MOST_EPISODES:
+        raise UserError(f"episodes={episodes} is impossible: it must be from 1 to {MOST_EPISODES}.")
     if not 0 <= seed <= LARGEST:
         raise UserError(f"seed={seed} is impossible: it must be from 0 to {LARGEST}.")
     run = run if isinstance(run, Run) else Run(run)

@@ -87,7 +87,7 @@ def explore(agent: Agent, task: Task, seed: Seed, first: Int[Array, ""], steps: 
     return seed, Stretch({}, log)
 
 
-def _sum_metrics(shapes: Metrics) -> Metrics:
+def _sum_metrics(shapes: Any) -> Metrics:
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from beliefrl import agents, phases, runs, tasks
 from beliefrl.agents import Agent
 from beliefrl.analysis.curves import draw_curve
-from beliefrl.evaluation import MODES, summary
+from beliefrl.evaluation import MODES, MOST_EPISODES, summary
 from beliefrl.phases import Metrics
 from beliefrl.rollout import Episode
 from beliefrl.runs import Recorder, Run
@@ -42,7 +42,8 @@ class Options:
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
-        check_range(self, ("steps", "eval_every", "eval_episodes", "replay_capacity"), 1)
+        check_range(self, ("steps", "eval_every", "replay_capacity"), 1)
+        check_range(self, ("eval_episodes",), 1, MOST_EPISODES)
         check_range(self, ("seeds",), 1, 10_000)
         check_range(self, ("seed",), 0, 2_000_000_000)
 
@@ -101,10 +102,12 @@ def stages(agent: Agent, task: Task, options: Options) -> Iterator[Event]:
 
 def _capacity(agent: Agent, options: Options) -> int:
     """Moments in a seed's replay: no more than can come, a moment a step and one more where an episode ends."""
-    start = min(agent.step_start_rl, options.steps)
-    needed = min(2 * start, agent.window.length + 1) if options.steps > start else 1
-    if options.replay_capacity < needed:
-        raise UserError(f"replay_capacity={options.replay_capacity} is too small: this agent needs at least {needed}.")
+    if options.steps > agent.step_start_rl:
+        needed = max(2 * agent.step_start_rl, agent.window.length + 1)  # `relive` wants all of the exploration
+        if options.replay_capacity < needed:
+            raise UserError(
+                f"replay_capacity={options.replay_capacity} is too small: this agent needs at least {needed}."
+            )
     return min(options.replay_capacity, 2 * options.steps)
 
 

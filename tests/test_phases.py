@@ -1,0 +1,134 @@
+"""The compiled phases: every window unbroken, seeds alone as together, cut as you like, each compiled once."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from beliefrl import agents, phases, tasks
+from worlds import Counting, CountingAgent
+
+SMALL = {
+    "step_start_rl": 20,
+    "train_times_fivrm": 10,
+    "seq_len": 8,
+    "burn_in": 4,
+    "batch_size": 2,
+    "d_size": 8,
+    "z_size": 4,
+    "hidden_size": 8,
+    "policy_layers": (8,),
+    "value_layers": (8,),
+}
+
+
+def trained(program, keys, cuts=(10, 10), learn=(2, 3)):
+    """Explore, pre-train, relive and learn, in stretches of these lengths."""
+    seeds, step, told = program.begin(keys), 0, []
+    for steps in cuts:
+        seeds, stretch = program.explore(seeds, step, steps)
+        step += steps
+    seeds, _ = program.pretrain(seeds, 0, 10)
+    seeds = program.relive(seeds)
+    for cycles in learn:
+        seeds, stretch = program.learn(seeds, step, cycles)
+        told.append(jax.tree.map(np.asarray, stretch))
+        step += 5 * cycles
+    return seeds, told
+
+
+@pytest.fixture(scope="module")
+def small():
+    agent, task = agents.make("vrm", **SMALL), tasks.make("pendulum-p", max_steps=9)
+    return phases.compile_program(agent, task, capacity=200, episodes=2)
+
+
+def leaves(tree):
+    return [
+        np.asarray(jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x)
+        for x in jax.tree.leaves(tree)
+    ]
+
+
+def test_a_seed_among_others_learns_as_it_does_alone(small):
+    keys = jax.random.split(jax.random.key(0), 3)
+    together, told = trained(small, keys)
+    alone, told_alone = trained(small, keys[1:2])
+    for ours, theirs in zip(leaves(together), leaves(alone), strict=True):
+        np.testing.assert_allclose(ours[1], theirs[0], rtol=1e-4, atol=1e-5)
+    for name, values in told[-1].metrics.items():
+        np.testing.assert_allclose(values[1], told_alone[-1].metrics[name][0], rtol=1e-3, atol=1e-4)
+    assert not np.allclose(leaves(together.state)[0][0], leaves(together.state)[0][1])
+
+
+def test_no_result_depends_on_where_the_training_is_cut(small):
+    keys = jax.random.split(jax.random.key(1), 1)
+    one, _ = trained(small, keys, cuts=(20,), learn=(5,))
+    other, _ = trained(small, keys, cuts=(7, 12, 1), learn=(1, 3, 1))
+    for ours, theirs in zip(leaves(one), leaves(other), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def counting(steps=120, task=None):
+    agent = CountingAgent()
+    traces = []
+
+    class Traced(Counting):
+        def step(self, state, action, key):
+            traces.append(1)
+            return super().step(state, action, key)
+
+    task = task or Traced()
+    program = phases.compile_program(agent, task, capacity=90, episodes=2)
+    seeds = program.begin(jax.random.split(jax.random.key(0), 2))
+    told, counts = [], []
+    for first, length in ((0, 4), (4, 6)):
+        seeds, _ = program.explore(seeds, first, length)
+        counts.append(len(traces))
+    for first in (0, 1):
+        seeds, metrics = program.pretrain(seeds, first, 1 + first)
+        told.append(metrics)
+    seeds = program.relive(seeds)
+    step = 10
+    for cycles in (1, 3, 5, steps // 4 - 9):
+        seeds, stretch = program.learn(seeds, step, cycles)
+        step += 4 * cycles
+        told.append(stretch.metrics)
+        counts.append(len(traces))
+    return seeds, told, counts
+
+
+def test_every_window_of_a_training_is_unbroken():
+    """The counter that the task shows is the agent's own count, through memory, resets, replay and its wrapping."""
+    for task in (Counting(max_steps=7), Counting(ends=3), Counting(ends=1), Counting(max_steps=50)):
+        seeds, told, _ = counting(task=task)
+        for metrics in told:
+            np.testing.assert_array_equal(metrics["broken"], 0)
+            assert (np.asarray(metrics["valid"]) > 0).all()
+        assert (np.asarray(seeds.state.seen) > 0).all()
+
+
+def test_each_phase_is_compiled_once_whatever_the_stretch():
+    _, _, counts = counting()
+    explore, learn = counts[:2], counts[2:]
+    assert explore[0] == explore[1]
+    assert len(set(learn)) == 1
+
+
+def test_steps_are_counted_as_environment_steps():
+    task = Counting(max_steps=7)
+    agent = CountingAgent()
+    program = phases.compile_program(agent, task, capacity=90, episodes=2)
+    seeds = program.begin(jax.random.split(jax.random.key(0), 1))
+    seeds, stretch = program.explore(seeds, 0, 50)
+    assert int(seeds.replay.added[0]) == 50 + 50 // 7  # every end of an episode is one moment more
+    assert int(stretch.episodes.done.sum()) == 50 // 7
+    assert int(seeds.actor.length[0]) == 50 % 7
+
+
+def test_evaluation_leaves_training_alone_and_separates_modes():
+    program = phases.compile_program(CountingAgent(), Counting(ends=4), capacity=90, episodes=3)
+    keys = jax.random.split(jax.random.key(0), 2)
+    result = program.evaluate(program.begin(keys).state, keys)
+    assert result.total.shape == (2, 2, 3)
+    np.testing.assert_array_equal(result.total, 10)
