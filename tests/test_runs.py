@@ -4,6 +4,7 @@ import json
 import os
 import pathlib
 import pickle
+import re
 
 import jax
 import jax.numpy as jnp
@@ -96,7 +97,7 @@ def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
 )
 def test_a_config_that_no_training_wrote_is_refused(tmp_path, config):
     (tmp_path / "config.json").write_text(json.dumps(config))
-    with pytest.raises(UserError, match="config.json"):
+    with pytest.raises(UserError, match="lacks what"):
         Run(tmp_path)
 
 
@@ -157,7 +158,7 @@ def test_loading_runs_no_code_from_the_file(recorder, tmp_path):
 
 def test_the_library_unpickles_nothing():
     for path in pathlib.Path(runs.__file__).parent.rglob("*.py"):
-        assert not {"pickle", "cloudpickle", "dill", "joblib", "allow_pickle"} & set(path.read_text().split()), path
+        assert not re.search(r"\b(pickle|cloudpickle|dill|joblib|allow_pickle)\b", path.read_text()), path
 
 
 def test_an_interrupted_write_leaves_the_old_file(tmp_path, monkeypatch):

@@ -42,7 +42,7 @@ class Run:
             UserError: it does not exist, or no training made it.
         """
         self.folder = pathlib.Path(folder)
-        if not os.path.isdir(self.folder):  # pathlib's raises where a name is too long
+        if not os.path.isdir(self.folder):  # noqa: PTH112 - pathlib's raises where a name is too long
             raise UserError(f"There is no run folder {self.folder}: give the --out of a training.")
         path = self.folder / "config.json"
         try:

@@ -29,9 +29,9 @@ def check_range(settings: Any, names: Sequence[str], low: int, high: int = LARGE
         value = getattr(settings, name)
         entries = value if isinstance(value, tuple) else (value,)
         whole = declared[name] in (int, tuple[int, ...])
-        kind = numbers.Integral if whole else numbers.Real
-        if not entries or not all(isinstance(entry, kind) and low <= entry <= high for entry in entries):
-            too_large = any(isinstance(entry, kind) and entry > high for entry in entries)
+        numeric = all(isinstance(entry, numbers.Integral if whole else numbers.Real) for entry in entries)
+        if not entries or not numeric or not all(low <= entry <= high for entry in entries):
+            too_large = numeric and any(entry > high for entry in entries)
             bounds = f"from {low} to {high}" if too_large or high < LARGEST else f"of at least {low}"
             number = "a whole number" if whole else "a number"
             raise UserError(f"{name}={value} is impossible: it must be {number} {bounds}.")

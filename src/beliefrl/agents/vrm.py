@@ -33,7 +33,7 @@ from beliefrl.soft_actor_critic import (
     update,
     valid_mean,
 )
-from beliefrl.types import Spec, Step, UserError, Window, WindowShape, check_choice, check_range, transitions
+from beliefrl.types import LARGEST, Spec, Step, UserError, Window, WindowShape, check_choice, check_range, transitions
 from beliefrl.variational_model import VRM, LSTMState, elbo_terms
 
 Metrics = dict[str, Float[Array, ""]]
@@ -124,8 +124,11 @@ class VRMAgent:
         """Refuse impossible values with a UserError."""
         check_range(self, ("seq_len", "batch_size", "train_interval_rl", "train_interval_klvrm"), 1)
         check_range(self, ("d_size", "z_size", "hidden_size", "policy_layers", "value_layers"), 1)
-        check_range(self, ("burn_in", "step_start_rl", "train_times_fivrm", "actor_regulariser"), 0)
+        check_range(self, ("burn_in", "train_times_fivrm", "actor_regulariser"), 0)
+        check_range(self, ("step_start_rl",), 2)  # fewer moments hold no transition to learn from
         check_range(self, ("lr_actor", "lr_critic", "lr_alpha", "lr_model", "gamma", "tau"), 0, 1)
+        if self.target_entropy is not None:
+            check_range(self, ("target_entropy",), -LARGEST)
         check_choice(self, "elbo_scaling", ("mean", "sum"))
         check_choice(self, "decode_from", ("posterior", "prior"))
         if self.train_interval_klvrm % self.train_interval_rl:

@@ -14,7 +14,6 @@ from beliefrl.types import Spec, UserError
 
 
 @runtime_checkable
-@runtime_checkable
 class Task(Protocol):
     """A frozen dataclass of physical constants with pure methods; no time limit and no reset of its own.
 
