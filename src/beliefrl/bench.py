@@ -6,6 +6,7 @@ need not add up to it exactly. Timings are medians.
 """
 
 import dataclasses
+import math
 import statistics
 import time
 from collections.abc import Callable
@@ -13,7 +14,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl import phases
@@ -114,7 +114,8 @@ def bench(agent: Agent, obs: int, actions: int, seeds: int = 1, started: float |
         ms_per_step and its parts acting_ms, controller_update_ms, model_update_ms, pretraining_ms, all per environment
         step; pretraining_ms_per_update; first_training_step_s (from the program's start to the end of the first
         cycle of learning, exploration and pre-training cut to one stretch); compile_s, its part that is compilation;
-        matmul_gflops, gflop_per_step, share_of_peak; parameters of one seed; obs, actions, seeds.
+        matmul_gflops; gflop_per_step, of the updates' matrix products as written; share_of_peak; parameters of one
+        seed; obs, actions, seeds.
     """
     if not 1 <= seeds <= 2 * PAPER_STEPS:
         raise UserError(f"seeds={seeds} is impossible: it must be from 1 to {2 * PAPER_STEPS}.")
@@ -163,26 +164,41 @@ def _update_parts(agent: Agent, timed: _Timed) -> tuple[dict[str, float], float]
         return ring.sample(replay, key, agent.cycle_windows, agent.window)
 
     windows = jax.jit(jax.vmap(sample))(seeds.replay, timed.keys)
-    begin_args = (seeds.state, windows, timed.keys)
-    # Where only the state is asked for, XLA drops the beliefs, so the difference is what they cost.
-    model = jax.jit(jax.vmap(lambda *args: agent.begin_cycle(*args)[0])).lower(*begin_args).compile()
-    begin = jax.jit(jax.vmap(lambda *args: agent.begin_cycle(*args)[:2])).lower(*begin_args).compile()
-    state, batches = begin(*begin_args)
-    batch = jax.tree.map(lambda leaf: leaf[:, 0], batches)
-    update = jax.jit(jax.vmap(lambda *args: agent.update(*args)[0])).lower(state, batch, timed.keys).compile()
+    given = (seeds.state, windows, timed.keys)
 
-    s_model, s_begin = median_seconds(lambda: model(*begin_args)), median_seconds(lambda: begin(*begin_args))
+    def mapped(function: Callable[..., Any]) -> Callable[..., Any]:
+        return jax.jit(jax.vmap(function))
+
+    # Where only the state is asked for, XLA drops the beliefs, so the difference is what they cost.
+    model = mapped(lambda *args: agent.begin_cycle(*args)[0])
+    begin = mapped(lambda *args: agent.begin_cycle(*args)[:2])
+    update = mapped(lambda *args: agent.update(*args)[0])
+    state, batches = begin(*given)
+    batch = jax.tree.map(lambda leaf: leaf[:, 0], batches)
+
+    s_model, s_begin = median_seconds(lambda: model(*given)), median_seconds(lambda: begin(*given))
     s_update = median_seconds(lambda: update(state, batch, timed.keys)) / agent.train_interval_rl
     parts = {
         "controller_update": s_update + max(s_begin - s_model, 0.0) / agent.cycle,
         "model_update": s_model / agent.cycle,
     }
-    flop = _flop(begin) / agent.cycle + _flop(update) / agent.train_interval_rl
+    flop = _flop(begin, *given) / agent.cycle + _flop(update, state, batch, timed.keys) / agent.train_interval_rl
     return parts, flop
 
 
-def _flop(compiled: Any) -> float:
-    """Floating-point operations of a compiled function by XLA's own count."""
-    analysis = compiled.cost_analysis()
-    analysis = analysis[0] if isinstance(analysis, list) else analysis
-    return float(np.nan_to_num(analysis.get("flops", 0.0)))
+def _flop(function: Callable[..., Any], *args: Any) -> float:
+    """Floating-point operations of a function's matrix products, those in loops as often as the loop runs."""
+
+    def count(jaxpr: Any) -> float:
+        total = 0.0
+        for equation in jaxpr.eqns:
+            if equation.primitive.name == "dot_general":
+                contracted = equation.params["dimension_numbers"][0][0]
+                sizes = [equation.invars[0].aval.shape[axis] for axis in contracted]
+                total += 2 * math.prod(equation.outvars[0].aval.shape) * math.prod(sizes)
+            inner = [getattr(value, "jaxpr", value) for value in jax.tree.leaves(list(equation.params.values()))]
+            runs = equation.params.get("length", 1) if equation.primitive.name == "scan" else 1
+            total += runs * sum(count(part) for part in inner if hasattr(part, "eqns"))
+        return total
+
+    return count(jax.make_jaxpr(function)(*args).jaxpr)
