@@ -1,5 +1,9 @@
 """Every test runs with the shapes in our signatures checked, and with no silent broadcasting between ranks."""
 
+import os
+
+os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")  # most of a test's time is compilation
+
 import jax
 import jaxtyping
 

@@ -176,7 +176,13 @@ def test_a_killed_training_can_be_evaluated_and_success_is_reported(tmp_path):
 def test_ctrl_c_ends_with_one_sentence(tmp_path):
     settings = SMALL | {"step_start_rl": 400_000}
     command = program(*TRAIN.split(), "--steps", 400_000, "--seeds", 1, *flags(settings), "--out", tmp_path / "run")
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),  # a background shell ignores it
+    ) as process:
         try:
             for line in process.stdout:
                 if line.endswith(" exploring\n"):
