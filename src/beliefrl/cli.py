@@ -110,9 +110,8 @@ def train(argv: Sequence[str]) -> None:
     results = run.results() or {}
     title = f"{name} on {options.task} after {results['step']:,} steps"
     console.print(results_table(results, run.seeds, title))
-    console.print(
-        f"saved in {run.folder}: see curve.png; `beliefrl evaluate {run.folder}` plays more episodes", highlight=False
-    )
+    told = f"saved in {run.folder}: see curve.png; `beliefrl evaluate {run.folder}` plays more episodes"
+    console.print(told, markup=False, highlight=False, soft_wrap=True)
 
 
 def evaluate(argv: Sequence[str]) -> None:

@@ -69,7 +69,7 @@ class TrainingDisplay:
         if not resumes and event.doing != "evaluating":
             self.phase_began, self.phase_step = now, event.step
             if not self.console.is_terminal:
-                self.console.print(f"[{duration(now - self.began)}] {event.doing}", markup=False, highlight=False)
+                self._line(now, event.doing)
         self.doing = event.doing
 
     def _speed(self, event: Event, now: float) -> str:
@@ -84,10 +84,14 @@ class TrainingDisplay:
         assert result is not None
         total, success = np.asarray(result.total), np.asarray(result.success)
         means = f"return {total[:, 0].mean():.1f} sampled, {total[:, 1].mean():.1f} mode"
-        line = f"[{duration(now - self.began)}] step {event.step:,}: {means}"
+        line = f"step {event.step:,}: {means}"
         if success.any():
             line += f"; success {success[:, 0].mean():.0%} sampled, {success[:, 1].mean():.0%} mode"
-        self.console.print(line, markup=False, highlight=False)
+        self._line(now, line)
+
+    def _line(self, now: float, line: str) -> None:
+        """Print a line that stays, with the time since the start."""
+        self.console.print(f"[{duration(now - self.began)}] {line}", markup=False, highlight=False, soft_wrap=True)
 
 
 def results_table(results: dict[str, Any], seeds: list[int], title: str) -> Table:
