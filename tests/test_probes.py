@@ -128,9 +128,11 @@ def test_vrm_swings_up_a_pendulum_whose_velocity_it_does_not_see():
         seeds, _ = program.explore(seeds, step, 100)
     seeds, _ = program.pretrain(seeds, 0, 1000)
     seeds = program.relive(seeds)
-    returns = []
-    for step in range(1000, 9000, 100):
-        seeds, _ = program.learn(seeds, step, 20)
-        if step >= 5900:
-            returns.append(float(program.evaluate(seeds.state, keys).total[0, 0].mean()))
-    assert max(returns) > -300  # random play gets about -1200
+    best = -float("inf")
+    for step in range(1000, 12_000, 500):
+        for stretch in range(step, step + 500, 100):
+            seeds, _ = program.learn(seeds, stretch, 20)
+        best = max(best, float(program.evaluate(seeds.state, keys).total[0, 0].mean()))
+        if best > -300:  # random play gets about -1200
+            break
+    assert best > -300

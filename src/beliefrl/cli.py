@@ -104,8 +104,7 @@ def train(argv: Sequence[str]) -> None:
     options = _parse(options_type, rest, f"beliefrl train {name}")
     task = tasks.make(options.task)
     console = Console()
-    start = min(options.agent.step_start_rl, options.training.steps)
-    with TrainingDisplay(console, options.training.steps, start) as display:
+    with TrainingDisplay(console, options.training.steps) as display:
         run = run_training(options.agent, task, options.out, display, **dataclasses.asdict(options.training))
     results = run.results() or {}
     title = f"{name} on {options.task} after {results['step']:,} steps"

@@ -26,9 +26,9 @@ class TrainingDisplay:
     Where the output is not a terminal, only the lines.
     """
 
-    def __init__(self, console: Console, steps: int, start: int):
-        """`steps` of each seed in all, of which `start` only explore."""
-        self.console, self.steps, self.start = console, steps, start
+    def __init__(self, console: Console, steps: int):
+        """`steps` of each seed in all."""
+        self.console, self.steps = console, steps
         columns = (TextColumn("{task.description:<26}"), BarColumn(), TextColumn("{task.fields[told]}"))
         self.progress = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
         self.bar = self.progress.add_task("starting", total=steps, told="")
