@@ -176,13 +176,12 @@ def test_a_killed_training_can_be_evaluated_and_success_is_reported(tmp_path):
 def test_ctrl_c_ends_with_one_sentence(tmp_path):
     settings = SMALL | {"step_start_rl": 400_000}
     command = program(*TRAIN.split(), "--steps", 400_000, "--seeds", 1, *flags(settings), "--out", tmp_path / "run")
-    with subprocess.Popen(
-        command,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),  # a background shell ignores it
-    ) as process:
+    # A shell's background job ignores SIGINT, and so would what is started from it.
+    listening = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from beliefrl.cli import main; main()"
+    )
+    command = [command[0], "-c", listening, *command[command.index("train") :]]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             for line in process.stdout:
                 if line.endswith(" exploring\n"):
