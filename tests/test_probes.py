@@ -113,26 +113,3 @@ def test_what_was_shown_once_is_remembered(shown_in):
     """Without memory the best mean return is 0, with it nearly 1."""
     _, total = learn(Recall(shown_in), 2000, **REMEMBERING)
     assert total > 0.8
-
-
-@pytest.mark.slow
-def test_vrm_swings_up_a_pendulum_whose_velocity_it_does_not_see():
-    """Full size; less pre-training than the paper's."""
-    from beliefrl import tasks
-
-    agent = agents.make("vrm", train_times_fivrm=1000)
-    program = phases.compile_program(agent, tasks.make("pendulum-p"), capacity=20_000, episodes=10)
-    keys = jax.random.split(jax.random.key(0), 1)
-    seeds, step = program.begin(keys), 0
-    for step in range(0, 1000, 100):
-        seeds, _ = program.explore(seeds, step, 100)
-    seeds, _ = program.pretrain(seeds, 0, 1000)
-    seeds = program.relive(seeds)
-    best = -float("inf")
-    for step in range(1000, 12_000, 500):
-        for stretch in range(step, step + 500, 100):
-            seeds, _ = program.learn(seeds, stretch, 20)
-        best = max(best, float(program.evaluate(seeds.state, keys).total[0, 0].mean()))
-        if best > -300:  # random play gets about -1200
-            break
-    assert best > -300
