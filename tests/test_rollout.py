@@ -79,8 +79,9 @@ def test_reliving_restores_notes_and_memory(steps):
     blank = jax.tree.map(lambda ring, new: ring.at[: new.shape[0]].set(new), replay.moments, moments)
     blank = blank._replace(note=jax.tree.map(lambda note: note * 0 - 9, blank.note))
     replay = ring.Replay(blank, jnp.array(moments.step.reward.shape[0]))
-    state = AGENT.init(jax.random.key(0), Counting().spec)
-    again, replay = jax.jit(lambda a, r: rollout.relive(AGENT, state, a, r, jax.random.key(1), 20))(actor, replay)
+    spec = Counting().spec
+    state = AGENT.init(jax.random.key(0), spec)
+    again, replay = jax.jit(lambda a, r: rollout.relive(AGENT, spec, state, a, r, jax.random.key(1), 20))(actor, replay)
     np.testing.assert_array_equal(replay.moments.note[0][: len(moments.note[0])], moments.note[0])
     assert float(again.memory) == float(actor.memory)
 

@@ -55,7 +55,7 @@ class CountingAgent:
     def init(self, key, spec):
         return CountingState(jnp.zeros(()), jnp.zeros((), int))
 
-    def reset(self):
+    def reset(self, spec):
         return jnp.zeros(())
 
     def act(self, state, memory, step, key, explore):

@@ -170,13 +170,15 @@ def _update_parts(agent: Agent, timed: _Timed) -> tuple[dict[str, float], float]
         return jax.jit(jax.vmap(function))
 
     # Where only the state is asked for, XLA drops the beliefs, so the difference is what they cost.
+    has_model = bool(jax.eval_shape(mapped(lambda *args: agent.begin_cycle(*args)[2]), *given))
     model = mapped(lambda *args: agent.begin_cycle(*args)[0])
     begin = mapped(lambda *args: agent.begin_cycle(*args)[:2])
     update = mapped(lambda *args: agent.update(*args)[0])
     state, batches = begin(*given)
     batch = jax.tree.map(lambda leaf: leaf[:, 0], batches)
 
-    s_model, s_begin = median_seconds(lambda: model(*given)), median_seconds(lambda: begin(*given))
+    s_begin = median_seconds(lambda: begin(*given))
+    s_model = median_seconds(lambda: model(*given)) if has_model else 0.0
     s_update = median_seconds(lambda: update(state, batch, timed.keys)) / agent.train_interval_rl
     parts = {
         "controller_update": s_update + max(s_begin - s_model, 0.0) / agent.cycle,

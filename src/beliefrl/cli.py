@@ -64,11 +64,11 @@ class ListOptions:
     """Print the names, one a line."""
 
 
-def _agent_options(agent: type, own: dict[str, Any]) -> type:
+def _agent_options(agent: Any, own: dict[str, Any]) -> type:
     """The options of a command on an agent: its own, (type, default) each, and the agent's hyperparameters."""
     fields = [(name, kind, dataclasses.field(default=default)) for name, (kind, default) in own.items()]
-    hyperparameters = Annotated[agent, tyro.conf.arg(name="", help="Hyperparameters of the agent.")]
-    fields.append(("agent", hyperparameters, dataclasses.field(default_factory=agent)))  # pyright: ignore[reportArgumentType]
+    hyperparameters = Annotated[type(agent), tyro.conf.arg(name="", help="Hyperparameters of the agent.")]
+    fields.append(("agent", hyperparameters, dataclasses.field(default=agent)))
     return dataclasses.make_dataclass("Options", fields, frozen=True)
 
 

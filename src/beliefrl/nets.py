@@ -6,14 +6,14 @@ biases uniform in ±1/√fan_in, an LSTM's in ±1/√size. A new module holds th
 
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Bool, Float, Key
 
 LOG_2PI = 1.8378770664093453
 TANH_EPSILON = 1e-6  # keeps the log-probability of a squashed action finite at ±1
@@ -68,6 +68,13 @@ def draw(key: Key[Array, ""], bounds: Params) -> Params:
     return structure.unflatten([leaf * part.reshape(leaf.shape) for leaf, part in zip(leaves, parts, strict=True)])
 
 
+class LSTMState(NamedTuple):
+    """What an LSTM remembers; zeros where an episode begins."""
+
+    d: Float[Array, "*batch d"]  # its output, the recurrent state of the paper
+    c: Float[Array, "*batch d"]  # its cell
+
+
 @jax.custom_vjp
 def lstm_state(gates: Float[Array, "*lead gates"], c: Float[Array, "*lead d"]) -> tuple[Array, Array]:
     """(d, c) of the next step from the gates' pre-activations i, f, g, o, each (*lead, d):
@@ -101,6 +108,68 @@ def _lstm_backward(saved, cotangents):
 
 
 lstm_state.defvjp(_lstm_forward, _lstm_backward)
+
+
+class LSTM(eqx.Module):
+    """An LSTM over time. Its weights are stored input by output, as the loop multiplies them; gates i, f, g, o."""
+
+    by_x: Float[Array, "input 4*d"]
+    by_d: Float[Array, "d 4*d"]
+    bias: Float[Array, " 4*d"]
+
+    def __init__(self, inputs: int, d: int):
+        self.by_x = jnp.full((inputs, 4 * d), d**-0.5)
+        self.by_d = jnp.full((d, 4 * d), d**-0.5)
+        self.bias = jnp.full((4 * d,), d**-0.5)
+
+    def start(self, batch: int) -> LSTMState:
+        """The state in which episodes begin."""
+        zeros = jnp.zeros((batch, self.by_d.shape[0]))
+        return LSTMState(zeros, zeros)
+
+    def unroll(
+        self, start: LSTMState, x: Float[Array, "time batch input"], is_first: Bool[Array, "time batch"]
+    ) -> LSTMState:
+        """The states at every step, from `start` and from zero wherever is_first; leaves (time, batch, d)."""
+        given = x @ self.by_x
+        return _lstm_loop(self.by_d, start, given + jnp.broadcast_to(self.bias, given.shape), is_first)[1]
+
+
+def _lstm_scan(by_d, start, given, is_first):
+    """d_{t-1} and the state after it, at every step."""
+
+    def step(state, inputs):
+        given, is_first = inputs
+        before = jax.tree.map(lambda leaf: jnp.where(is_first[:, None], 0.0, leaf), state)
+        state = LSTMState(*lstm_state(given + before.d @ by_d, before.c))
+        return state, (before.d, state)
+
+    return jax.lax.scan(step, start, (given, is_first))[1]
+
+
+@jax.custom_vjp
+def _lstm_loop(by_d, start, given, is_first):
+    return _lstm_scan(by_d, start, given, is_first)
+
+
+def _lstm_loop_forward(by_d, start, given, is_first):
+    result, pullback = jax.vjp(lambda start, given: _lstm_scan(by_d, start, given, is_first), start, given)
+    return result, (result[0], pullback)
+
+
+def _lstm_loop_backward(saved, cotangent):
+    """The gradient of by_d is one product after the loop; plain differentiation would add one up at every step."""
+    before, pullback = saved
+    by_start, by_given = pullback(cotangent)
+    return jnp.einsum("tbm,tbn->mn", before, by_given), by_start, by_given, None
+
+
+_lstm_loop.defvjp(_lstm_loop_forward, _lstm_loop_backward)
+
+
+class Gaussian(NamedTuple):
+    mean: Float[Array, "*shape"]
+    sigma: Float[Array, "*shape"]
 
 
 def gaussian_log_prob(

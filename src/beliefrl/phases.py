@@ -24,6 +24,7 @@ from beliefrl.agents import Agent
 from beliefrl.replay import Replay
 from beliefrl.rollout import Actor, Episode
 from beliefrl.tasks import Task
+from beliefrl.types import Spec
 
 Metrics = dict[str, Float[Array, "..."]]
 
@@ -110,11 +111,11 @@ def pretrain(agent: Agent, seed: Seed, first: Int[Array, ""], updates: Int[Array
     return seed, jax.tree.map(lambda total: total / jnp.maximum(updates, 1), totals)
 
 
-def relive(agent: Agent, seed: Seed) -> Seed:
+def relive(agent: Agent, spec: Spec, seed: Seed) -> Seed:
     """Perceive again, with the pre-trained networks, everything recorded so far (at most 2 moments a step)."""
     length = min(2 * agent.step_start_rl, ring.capacity(seed.replay))
     key = jax.random.fold_in(seed.key, RELIVE)
-    actor, replay = rollout.relive(agent, seed.state, seed.actor, seed.replay, key, length)
+    actor, replay = rollout.relive(agent, spec, seed.state, seed.actor, seed.replay, key, length)
     return seed._replace(actor=actor, replay=replay)
 
 
@@ -188,7 +189,7 @@ def compile_program(agent: Agent, task: Task, capacity: int, episodes: int) -> P
         begin=jax.jit(jax.vmap(partial(begin, agent, task, capacity))),
         explore=mapped(partial(explore, agent, task), 2),
         pretrain=mapped(partial(pretrain, agent), 2),
-        relive=mapped(partial(relive, agent), 0),
+        relive=mapped(partial(relive, agent, task.spec), 0),
         learn=mapped(partial(learn, agent, task), 2),
         evaluate=jax.jit(jax.vmap(partial(evaluate, agent, task, episodes=episodes))),
     )

@@ -21,7 +21,7 @@ from beliefrl import replay as ring
 from beliefrl.agents import Agent
 from beliefrl.replay import Replay
 from beliefrl.tasks import Task
-from beliefrl.types import Moment, Step
+from beliefrl.types import Moment, Spec, Step
 
 
 class Actor(NamedTuple):
@@ -63,7 +63,7 @@ def begin(agent: Agent, task: Task, key: Key[Array, ""]) -> Actor:
         is_first=jnp.array(True),
         terminated=jnp.array(False),
     )
-    return _strong(Actor(task_state, step, agent.reset(), jnp.array(0), jnp.array(0.0)))
+    return _strong(Actor(task_state, step, agent.reset(task.spec), jnp.array(0), jnp.array(0.0)))
 
 
 def moment(agent: Agent, actor: Actor) -> Moment:
@@ -101,24 +101,24 @@ def advance(
 
 
 def relive(
-    agent: Agent, state: Any, actor: Actor, replay: Replay, key: Key[Array, ""], length: int
+    agent: Agent, spec: Spec, state: Any, actor: Actor, replay: Replay, key: Key[Array, ""], length: int
 ) -> tuple[Actor, Replay]:
     """Perceive the first `length` moments of the replay again with networks that have changed since.
 
     Returns the actor with the memory it would have now, and the replay with new notes.
     """
     steps, exists = ring.history(replay, length)
+    empty = agent.reset(spec)
 
     def perceive(memory, moment):
         step, exists, key = moment
-        empty = agent.reset()
         before = jax.tree.map(lambda new, old: jnp.where(step.is_first, new, old), empty, memory)
         _, after = agent.act(state, before, step, key, jnp.array(True))
         memory = jax.tree.map(lambda new, old: jnp.where(exists, new, old), after, memory)
         return memory, agent.note(memory)
 
-    memory, notes = jax.lax.scan(perceive, agent.reset(), (steps, exists, jax.random.split(key, length)))
-    memory = jax.tree.map(lambda old, new: jnp.where(actor.step.is_first, old, new), agent.reset(), memory)
+    memory, notes = jax.lax.scan(perceive, empty, (steps, exists, jax.random.split(key, length)))
+    memory = jax.tree.map(lambda old, new: jnp.where(actor.step.is_first, old, new), empty, memory)
     return actor._replace(memory=memory), ring.annotate(replay, notes, length)
 
 

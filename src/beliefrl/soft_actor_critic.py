@@ -77,16 +77,25 @@ class Batch(NamedTuple):
     reward: Float[Array, " batch"]  # r_t
     terminated: Bool[Array, " batch"]  # s_{t+1} is terminal
     valid: Bool[Array, " batch"]  # what is not counts nowhere
+    seen: Float[Array, "batch seen"] | None = None  # what the actor reads where that is not s_t (SLAC)
 
 
 def init_controller(
-    belief: int, action: int, policy_layers: tuple[int, ...], value_layers: tuple[int, ...], key: Key[Array, ""]
+    belief: int,
+    action: int,
+    policy_layers: tuple[int, ...],
+    value_layers: tuple[int, ...],
+    key: Key[Array, ""],
+    seen: int | None = None,
 ) -> Controller:
-    """A new controller for beliefs and actions of these sizes; V̄ starts as V, log α at 0."""
+    """A new controller for beliefs and actions of these sizes; V̄ starts as V, log α at 0.
+
+    `seen` is the size of what the actor reads, where that is not the belief.
+    """
+    actor = Actor(belief if seen is None else seen, action, policy_layers)
     critic = MLP((belief + action, *value_layers, 1), jax.nn.relu)
     value = MLP((belief, *value_layers, 1), jax.nn.relu)
-    bounds = Controller(Actor(belief, action, policy_layers), (critic, critic), value, value, jnp.zeros(()))
-    controller = draw(key, bounds)
+    controller = draw(key, Controller(actor, (critic, critic), value, value, jnp.zeros(())))
     return controller._replace(target_value=jax.tree.map(jnp.copy, controller.value))
 
 
@@ -105,26 +114,21 @@ def value_loss(
 def q_loss(critics: tuple[MLP, MLP], target_value: MLP, batch: Batch, gamma: float) -> Float[Array, ""]:
     """J_Q of both critics, summed."""
     beyond = jnp.where(batch.terminated, 0.0, state_value(target_value, batch.next_belief))
-    target = batch.reward + gamma * beyond
+    target = jax.lax.stop_gradient(batch.reward + gamma * beyond)
     errors = [q_value(critic, batch.belief, batch.action) - target for critic in critics]
     return valid_mean(0.5 * errors[0] ** 2 + 0.5 * errors[1] ** 2, batch.valid)
 
 
 def actor_loss(
-    actor: Actor,
-    controller: Controller,
-    belief: Float[Array, "batch belief"],
-    valid: Bool[Array, " batch"],
-    noise: Float[Array, "batch action"],
-    regulariser: float,
+    actor: Actor, controller: Controller, batch: Batch, noise: Float[Array, "batch action"], regulariser: float
 ) -> tuple[Float[Array, ""], tuple[Float[Array, " batch"], Float[Array, " batch"]]]:
-    """J_π; beside it min_i Q_i(s, ã) and log π(ã|s)."""
-    mean, log_sigma = jax.vmap(actor)(belief)
+    """J_π; beside it min_i Q_i(s, ã) and log π(ã|s). The belief that Q reads is held still: Q is not to improve."""
+    mean, log_sigma = jax.vmap(actor)(batch.belief if batch.seen is None else batch.seen)
     action, log_prob = jax.vmap(tanh_gaussian)(mean, log_sigma, noise)
-    q = controller.q(belief, action)
+    q = controller.q(jax.lax.stop_gradient(batch.belief), action)
     size = jnp.mean(mean**2, axis=-1) + jnp.mean(jnp.exp(2 * log_sigma), axis=-1)
     alpha = jnp.exp(controller.log_alpha)
-    return valid_mean(alpha * log_prob - q + 0.5 * regulariser * size, valid), (q, log_prob)
+    return valid_mean(alpha * log_prob - q + 0.5 * regulariser * size, batch.valid), (q, log_prob)
 
 
 def alpha_loss(
@@ -134,28 +138,28 @@ def alpha_loss(
     return -log_alpha * valid_mean(log_prob + target_entropy, valid)
 
 
-def gradients(
+def loss(
     controller: Controller,
     batch: Batch,
     noise: Float[Array, "batch action"],
     gamma: float,
     regulariser: float,
     target_entropy: float | None = None,
-) -> tuple[Controller, dict[str, Float[Array, ""]]]:
-    """The gradients of the four losses, all at the same parameters (V̄'s are None), and what to log.
+) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
+    """J_π + J_V + J_Q + J_α, in each of which all that it does not train is held still; and what to log.
 
-    `noise` is standard normal, one vector a transition: the sample ã. `target_entropy` None is -DOF.
+    So its gradient is that of the four losses at the same parameters (V̄'s is zero), and where the beliefs are formed
+    by a network that learns as well (`sac-lstm`), the gradient of J_π, J_V and J_Q in it. `noise` is standard normal,
+    one vector a transition: the sample ã. `target_entropy` None is -DOF.
     """
-    (j_pi, (q, log_prob)), g_actor = jax.value_and_grad(actor_loss, has_aux=True)(
-        controller.actor, controller, batch.belief, batch.valid, noise, regulariser
-    )
-    alpha = jnp.exp(controller.log_alpha)
-    target = q - alpha * log_prob
-    j_v, g_value = jax.value_and_grad(value_loss)(controller.value, batch.belief, target, batch.valid)
-    j_q, g_critics = jax.value_and_grad(q_loss)(controller.critics, controller.target_value, batch, gamma)
-    if target_entropy is None:
-        target_entropy = -float(batch.action.shape[-1])
-    g_alpha = jax.grad(alpha_loss)(controller.log_alpha, log_prob, batch.valid, target_entropy)
+    still = jax.lax.stop_gradient(controller)
+    j_pi, extras = actor_loss(controller.actor, still, batch, noise, regulariser)
+    q, log_prob = jax.lax.stop_gradient(extras)
+    alpha = jnp.exp(still.log_alpha)
+    j_v = value_loss(controller.value, batch.belief, q - alpha * log_prob, batch.valid)
+    j_q = q_loss(controller.critics, still.target_value, batch, gamma)
+    target_entropy = -float(batch.action.shape[-1]) if target_entropy is None else target_entropy
+    j_alpha = alpha_loss(controller.log_alpha, log_prob, batch.valid, target_entropy)
     metrics = {
         "loss_value": j_v,
         "loss_q": j_q,
@@ -164,7 +168,7 @@ def gradients(
         "entropy": -valid_mean(log_prob, batch.valid),
         "q": valid_mean(q, batch.valid),
     }
-    return Controller(g_actor, g_critics, g_value, None, g_alpha), metrics  # pyright: ignore[reportArgumentType]
+    return j_pi + j_v + j_q + j_alpha, metrics
 
 
 def soft_update(target: MLP, value: MLP, tau: float) -> MLP:

@@ -9,6 +9,8 @@ import numbers
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 
@@ -66,6 +68,11 @@ class Step(NamedTuple):
     terminated: Bool[Array, "*batch"]  # o_t is terminal: there is no value beyond it
 
 
+def perception(step: Step) -> Float[Array, "*batch x"]:
+    """x_t = (o_t, r_{t-1})."""
+    return jnp.concatenate([step.obs, step.reward[..., None]], axis=-1)
+
+
 class Moment(NamedTuple):
     """What the replay keeps of a moment: the step, and the agent's own note of it (any pytree, may be empty)."""
 
@@ -92,3 +99,8 @@ def transitions(window: Window, burn_in: int) -> Bool[Array, "*batch length"]:
     """Which pairs of neighbours after the burn-in are transitions; (..., time) gives (..., time - burn_in - 1)."""
     now, after = window.exists[..., burn_in:-1], window.exists[..., burn_in + 1 :]
     return now & after & ~window.step.is_first[..., burn_in + 1 :]
+
+
+def time_major(window: Window, start: int, stop: int | None) -> Window:
+    """The moments from `start` to `stop` of windows (batch, time, ...) as (time, batch, ...)."""
+    return jax.tree.map(lambda leaf: leaf[:, start:stop].swapaxes(0, 1), window)

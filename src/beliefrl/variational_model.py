@@ -23,21 +23,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from beliefrl.nets import MLP, Linear, gaussian_kl, gaussian_log_prob, lstm_state
+from beliefrl.nets import MLP, Gaussian, Linear, LSTMState, gaussian_kl, gaussian_log_prob, lstm_state
 
 SIGMA_X_MIN = 1e-3
-
-
-class LSTMState(NamedTuple):
-    """What an LSTM remembers; zeros where an episode begins."""
-
-    d: Float[Array, "*batch d"]  # its output, the recurrent state of the paper
-    c: Float[Array, "*batch d"]  # its cell
-
-
-class Gaussian(NamedTuple):
-    mean: Float[Array, "*shape"]
-    sigma: Float[Array, "*shape"]
 
 
 class Inferred(NamedTuple):
@@ -70,12 +58,18 @@ class Joint(eqx.Module):
         self.by_z = jnp.full((z, 4 * d), gates)
 
     def given(
-        self, features: Float[Array, "time batch hidden"], prev_action: Float[Array, "time batch action"]
+        self,
+        features: Float[Array, "time batch hidden"],
+        prev_action: Float[Array, "time batch action"],
+        posterior_sees: bool = True,
     ) -> Float[Array, "time batch joint"]:
-        """What the layer gets from f_x(x_t) and a_{t-1}."""
+        """What the layer gets from f_x(x_t) and a_{t-1}; without f_x(x_t) for the posterior unless it sees it."""
         posterior = prev_action @ self.by_action
         gates = jnp.zeros((*posterior.shape[:-1], self.by_z.shape[1]))
-        everything = features @ self.by_features + jnp.concatenate([posterior, gates], axis=-1)
+        by_features = self.by_features
+        if not posterior_sees:
+            by_features = by_features.at[:, : posterior.shape[-1]].set(0.0)
+        everything = features @ by_features + jnp.concatenate([posterior, gates], axis=-1)
         return everything + jnp.broadcast_to(self.bias, everything.shape)
 
 
@@ -90,9 +84,14 @@ class VRM(eqx.Module):
     prior_sigma: MLP
     decoder_mean: MLP
     decoder_sigma: MLP
+    deterministic: bool = eqx.field(static=True)
 
-    def __init__(self, x: int, action: int, d: int, z: int, hidden: int):
-        """Widths: perception (observation and reward), action, d, z, and every hidden layer."""
+    def __init__(self, x: int, action: int, d: int, z: int, hidden: int, deterministic: bool = False):
+        """Widths: perception (observation and reward), action, d, z, and every hidden layer.
+
+        In a `deterministic` model posterior and prior are one, z_t = μ_q[d_{t-1}, a_{t-1}] (Appendix C); it does
+        not use its networks of the prior and of any σ.
+        """
 
         def net(*sizes: int) -> MLP:
             return MLP(sizes, jnp.tanh)
@@ -102,6 +101,7 @@ class VRM(eqx.Module):
         self.posterior_mean, self.posterior_sigma = Linear(hidden, z), Linear(hidden, z)
         self.prior_mean, self.prior_sigma = net(d + action, hidden, z), net(d + action, hidden, z)
         self.decoder_mean, self.decoder_sigma = net(d + z, hidden, hidden, x), net(d + z, hidden, hidden, x)
+        self.deterministic = deterministic
 
     def start(self, batch: int) -> LSTMState:
         """The state in which episodes begin."""
@@ -127,7 +127,8 @@ class VRM(eqx.Module):
         noise: Float[Array, "time batch z"],
     ) -> Inferred:
         """Unroll the inference model with z_t = μ_q + σ_q · noise_t, from `start` and from zero wherever is_first."""
-        given = self.joint.given(jax.vmap(jax.vmap(self.features))(x), prev_action)
+        given = self.joint.given(jax.vmap(jax.vmap(self.features))(x), prev_action, not self.deterministic)
+        noise = jnp.zeros_like(noise) if self.deterministic else noise
         weights = Loop(self.joint.by_d, self.joint.by_z, self.posterior_mean, self.posterior_sigma)
         return _loop(weights, start, given, is_first, noise)
 
@@ -158,6 +159,12 @@ def elbo_terms(
     reduce = {"mean": jnp.mean, "sum": jnp.sum}[scaling]
     kl = reduce(gaussian_kl(*inferred.posterior, *prior), axis=-1)
     return Terms(kl, reduce(gaussian_log_prob(x, *decoded), axis=-1))
+
+
+def prediction_error(vrm: VRM, inferred: Inferred, x: Float[Array, "time batch x"]) -> Float[Array, "time batch"]:
+    """The squared error of a deterministic model's prediction of x_t, mean over its dimensions."""
+    predicted = jax.vmap(jax.vmap(vrm.decode))(inferred.before, inferred.z).mean
+    return jnp.mean((predicted - x) ** 2, axis=-1)
 
 
 class Loop(NamedTuple):

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from beliefrl import agents
-from beliefrl.agents.vrm import VRMAgent, _time_major
+from beliefrl.agents.vrm import VRMAgent
 from beliefrl.nets import draw
-from beliefrl.types import Spec, Step, UserError, Window, check_choice
+from beliefrl.types import Spec, Step, UserError, Window, check_choice, time_major
 from beliefrl.variational_model import VRM, Gaussian, Loop, LSTMState, _loop, _scan
 
 SMALL = {
@@ -130,7 +130,7 @@ def test_pretraining_trains_the_first_impression_model_alone(state):
 
 @jax.jit
 def infer(vrm, window, noise):
-    moments = _time_major(window, 0, None)
+    moments = time_major(window, 0, None)
     x = jnp.concatenate([moments.step.obs, moments.step.reward[..., None]], axis=-1)
     return vrm.infer(vrm.start(noise.shape[1]), x, moments.step.prev_action, moments.step.is_first, noise)
 
@@ -149,7 +149,7 @@ def test_an_episode_inside_a_window_begins_with_an_empty_memory(state):
 def test_the_burn_in_and_the_sequence_are_one_unroll(state):
     window = windows(jax.random.key(1), 3)
     noise = jax.random.normal(jax.random.key(2), (11, 3, AGENT.z_size))
-    moments = _time_major(window, 0, None)
+    moments = time_major(window, 0, None)
     x = jnp.concatenate([moments.step.obs, moments.step.reward[..., None]], axis=-1)
     whole = infer(state.keep, window, noise)
     start = jax.tree.map(lambda leaf: leaf[3], whole.state)
@@ -163,7 +163,7 @@ def test_acting_forms_the_belief_that_replay_forms(state):
     """Moment by moment as an actor and at once as the replay: the same d, with the same z."""
     window = windows(jax.random.key(1), 1)
     at_once = infer(state.keep, window, jnp.zeros((11, 1, AGENT.z_size)))
-    memory, mode, act = AGENT.reset(), jnp.array(False), jax.jit(AGENT.act)
+    memory, mode, act = AGENT.reset(SPEC), jnp.array(False), jax.jit(AGENT.act)
     for t in range(11):
         step = jax.tree.map(lambda leaf, t=t: leaf[0, t], window.step)
         _, memory = act(state, memory, step, jax.random.key(t), mode)
@@ -174,7 +174,7 @@ def test_mode_actions_are_deterministic_and_samples_are_not(state):
     step = jax.tree.map(lambda leaf: leaf[0, 0], windows(jax.random.key(1), 1).step)
     act = jax.jit(AGENT.act)
     actions = {
-        mode: [act(state, AGENT.reset(), step, jax.random.key(k), jnp.array(mode))[0] for k in (1, 2)]
+        mode: [act(state, AGENT.reset(SPEC), step, jax.random.key(k), jnp.array(mode))[0] for k in (1, 2)]
         for mode in (False, True)
     }
     np.testing.assert_array_equal(*actions[False])
@@ -220,8 +220,8 @@ def test_a_recomputed_first_impression_is_the_stored_one_up_to_its_sample(state)
     recompute = dataclasses.replace(AGENT, store_first_impression=False)
     window = windows(jax.random.key(1), 10)
     key_first, _ = jax.random.split(jax.random.key(2))
-    moments = _time_major(window, 0, None)
-    d_first = jax.jit(AGENT.states)(state.first, moments, key_first)
+    moments = time_major(window, 0, None)
+    d_first = jax.jit(AGENT.unroll)(state.first, moments, key_first).d
     stored = jax.jit(AGENT.batches)(state, window._replace(note=(d_first.swapaxes(0, 1),)), jax.random.key(2))
     again = jax.jit(recompute.batches)(state, window._replace(note=()), jax.random.key(2))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), stored, again)

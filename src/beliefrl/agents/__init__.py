@@ -2,10 +2,13 @@
 
 import dataclasses
 import difflib
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from jaxtyping import Array, Bool, Float, Key
 
+from beliefrl.agents.sac_lstm import SACLSTMAgent
+from beliefrl.agents.sac_mlp import SACMLPAgent
+from beliefrl.agents.slac import SLACAgent
 from beliefrl.agents.vrm import VRMAgent
 from beliefrl.types import Spec, Step, UserError, Window, WindowShape
 
@@ -47,7 +50,7 @@ class Agent(Protocol):
         """The state before training: networks and optimisers."""
         ...
 
-    def reset(self) -> Any:
+    def reset(self, spec: Spec) -> Any:
         """The empty memory of one actor."""
         ...
 
@@ -74,18 +77,37 @@ class Agent(Protocol):
         ...
 
 
-AGENTS: dict[str, type] = {
-    "vrm": VRMAgent,
+class Entry(NamedTuple):
+    agent: Any  # with the hyperparameters that the name stands for
+    about: str
+
+
+def _own(agent: type) -> Entry:
+    """An agent under its own name: as it is, and described by its docstring."""
+    return Entry(agent(), (agent.__doc__ or "").split("\n")[0])
+
+
+AGENTS: dict[str, Entry] = {
+    "vrm": _own(VRMAgent),
+    "sac-mlp": _own(SACMLPAgent),
+    "sac-lstm": _own(SACLSTMAgent),
+    "slac": _own(SLACAgent),
+    "vrm-single": Entry(VRMAgent(models="single"), "Ablation: one model that is pre-trained and keeps learning."),
+    "vrm-first": Entry(VRMAgent(models="first"), "Ablation: only the first-impression model."),
+    "vrm-keep": Entry(VRMAgent(models="keep"), "Ablation: only the keep-learning model."),
+    "vrm-deterministic": Entry(
+        VRMAgent(deterministic=True), "Ablation: models without noise, trained on squared error."
+    ),
 }
 
 
 def names() -> dict[str, str]:
     """Every agent's name with a sentence on it."""
-    return {name: (agent.__doc__ or "").split("\n")[0] for name, agent in AGENTS.items()}
+    return {name: entry.about for name, entry in AGENTS.items()}
 
 
-def find(name: str) -> type:
-    """The class of the agent of that name.
+def find(name: str) -> Any:
+    """The agent of that name with the hyperparameters that the name stands for.
 
     Raises:
         UserError: no agent has that name.
@@ -94,7 +116,7 @@ def find(name: str) -> type:
         near = difflib.get_close_matches(name, AGENTS, n=1)
         hint = f"did you mean {near[0]}?" if near else f"there is {', '.join(AGENTS)}."
         raise UserError(f"There is no agent {name!r}: {hint}")
-    return AGENTS[name]
+    return AGENTS[name].agent
 
 
 def make(name: str, **hyperparameters: Any) -> Agent:
@@ -110,12 +132,18 @@ def make(name: str, **hyperparameters: Any) -> Agent:
             near = difflib.get_close_matches(given, known, n=1)
             hint = f"did you mean {near[0]}?" if near else f"it has {', '.join(known)}."
             raise UserError(f"The agent {name} has no hyperparameter {given!r}: {hint}")
-    return agent(**hyperparameters)
+    return dataclasses.replace(agent, **hyperparameters)
 
 
 def name_of(agent: Agent) -> str:
-    """The name under which `make` finds an agent's class; module:Class for one that is not in this library."""
-    for name, known in AGENTS.items():
-        if type(agent) is known:
-            return name
-    return f"{type(agent).__module__}:{type(agent).__qualname__}"
+    """The name under which `make` finds an agent; module:Class for one that is not in this library.
+
+    Of names that share a class (the ablations) it is the one whose own settings the agent has.
+    """
+    found = None
+    for name, (known, _) in AGENTS.items():
+        if type(agent) is type(known):
+            own = [field.name for field in dataclasses.fields(known) if getattr(known, field.name) != field.default]
+            if all(getattr(agent, field) == getattr(known, field) for field in own):
+                found = name
+    return found or f"{type(agent).__module__}:{type(agent).__qualname__}"

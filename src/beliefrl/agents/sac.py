@@ -1,0 +1,96 @@
+"""What all agents of the paper share: the hyperparameters of Table 1, and the controller that they describe."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import optax
+from jaxtyping import Array, Float, Key
+
+from beliefrl.soft_actor_critic import (
+    Batch,
+    Controller,
+    Optimisers,
+    OptimiserState,
+    init_controller,
+    init_optimisers,
+    loss,
+    update,
+)
+from beliefrl.types import LARGEST, check_range
+
+Metrics = dict[str, Float[Array, ""]]
+
+
+@dataclasses.dataclass(frozen=True)
+class SAC:
+    """A soft actor-critic, to be given beliefs (Table 1)."""
+
+    gamma: float = 0.99
+    """Discount factor γ, in [0, 1] (Table 1)."""
+    step_start_rl: int = 1000
+    """Environment steps before training starts; the untrained policy acts until then (Table 1)."""
+    train_interval_rl: int = 1
+    """Environment steps between two updates of the controller (Table 1)."""
+    lr_actor: float = 3e-4
+    """Adam's learning rate for the actor (Table 1)."""
+    lr_critic: float = 3e-4
+    """Adam's learning rate for both Q and V (Table 1)."""
+    lr_alpha: float = 3e-4
+    """Adam's learning rate for log α, the temperature (Table 1)."""
+    target_entropy: float | None = None
+    """Entropy that α steers to; None is minus the number of actions (Table 1)."""
+    tau: float = 0.005
+    """Fraction by which the target V moves at each update, in [0, 1] (Table 1)."""
+    policy_layers: tuple[int, ...] = (256, 256)
+    """Hidden layers of μ and log σ of the policy (Table 1)."""
+    value_layers: tuple[int, ...] = (256, 256)
+    """Hidden layers of Q and V (Table 1)."""
+    actor_regulariser: float = 1e-3
+    """Weight of half the mean squares of the policy's μ and σ in the actor's loss (the authors' code; 0 is off)."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible values with a UserError."""
+        check_range(self, ("train_interval_rl", "policy_layers", "value_layers"), 1)
+        check_range(self, ("actor_regulariser",), 0)
+        check_range(self, ("step_start_rl",), 2)  # fewer moments hold no transition to learn from
+        check_range(self, ("lr_actor", "lr_critic", "lr_alpha", "gamma", "tau"), 0, 1)
+        if self.target_entropy is not None:
+            check_range(self, ("target_entropy",), -LARGEST)
+
+    @property
+    def optimisers(self) -> Optimisers:
+        return Optimisers(optax.adam(self.lr_actor), optax.adam(self.lr_critic), optax.adam(self.lr_alpha))
+
+    def init_controller(
+        self, key: Key[Array, ""], belief: int, action: int, seen: int | None = None
+    ) -> tuple[Controller, OptimiserState]:
+        """A new controller and its optimisers; `seen` is what the actor reads, where that is not the belief."""
+        controller = init_controller(belief, action, self.policy_layers, self.value_layers, key, seen)
+        return controller, init_optimisers(self.optimisers, controller)
+
+    def controller_loss(
+        self, controller: Controller, batch: Batch, key: Key[Array, ""]
+    ) -> tuple[Float[Array, ""], Metrics]:
+        """The four losses of soft actor-critic, summed; and what to log."""
+        noise = jax.random.normal(key, batch.action.shape)
+        return loss(controller, batch, noise, self.gamma, self.actor_regulariser, self.target_entropy)
+
+    def learn_controller(
+        self, controller: Controller, state: OptimiserState, batch: Batch, key: Key[Array, ""]
+    ) -> tuple[Controller, OptimiserState, Metrics]:
+        """One update on transitions whose beliefs are given."""
+        gradient, metrics = jax.grad(self.controller_loss, has_aux=True)(controller, batch, key)
+        controller, state = update(self.optimisers, state, controller, gradient, self.tau)
+        return controller, state, metrics
+
+
+def split_updates(moments: Any, windows: int) -> Any:
+    """(time, update · windows, ...) to (update, time · windows, ...): a cycle's moments for each of its updates."""
+
+    def split(leaf: Array) -> Array:
+        time, both, *rest = leaf.shape
+        leaf = leaf.reshape(time, both // windows, windows, *rest).swapaxes(0, 1)
+        return leaf.reshape(both // windows, time * windows, *rest)
+
+    return jax.tree.map(split, moments)

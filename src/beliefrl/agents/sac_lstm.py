@@ -1,0 +1,156 @@
+"""SAC-LSTM: a soft actor-critic on the state of an LSTM, both trained by the losses of the controller, end to end.
+
+Source: Section 5, Table 1, Appendix A.2.2 and A.1.2. The belief is d_t = LSTM(d_{t-1}; o_t). Sequences, burn-in and
+resets inside windows are those of VRM; the gradients of J_π (through μ and log σ), J_V and J_Q reach the LSTM, those
+through the targets and through the Q of the actor's loss do not.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Key
+
+from beliefrl.agents.sac import SAC, Metrics, split_updates
+from beliefrl.nets import LSTM, LSTMState, descend, draw, tanh_gaussian
+from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState, update
+from beliefrl.types import Spec, Step, Window, WindowShape, check_range, time_major, transitions
+
+
+class State(NamedTuple):
+    """Everything that training changes."""
+
+    lstm: LSTM
+    controller: Controller
+    lstm_optimiser: optax.OptState
+    controller_optimiser: OptimiserState
+
+
+@dataclasses.dataclass(frozen=True)
+class SACLSTMAgent(SAC):
+    """Soft actor-critic on an LSTM of the observations, trained end to end (Han, Doya, Tani 2020, Appendix A.2.2)."""
+
+    seq_len: int = 64
+    """Steps in a sampled sequence (Appendix A.1.2)."""
+    batch_size: int = 4
+    """Sequences in an update (Appendix A.1.2)."""
+    burn_in: int = 64
+    """Most steps before a sequence that are unrolled from a zero state to begin it (Appendix A.1.2)."""
+    d_size: int = 256
+    """Size of the LSTM's state (Appendix A.2.2)."""
+    lr_lstm: float = 3e-4
+    """Adam's learning rate for the LSTM (the authors' code)."""
+    pretrain_updates: int = 5000
+    """Updates of the whole at step_start_rl, as many as VRM's pre-training has (Section 5; 0 is off)."""
+    perceive_action: bool = False
+    """Let the LSTM perceive the previous action beside the observation (the paper's does not)."""
+    perceive_reward: bool = False
+    """Let the LSTM perceive the previous reward beside the observation (the paper's does not)."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible values with a UserError."""
+        super().__post_init__()
+        check_range(self, ("seq_len", "batch_size", "d_size"), 1)
+        check_range(self, ("burn_in", "pretrain_updates"), 0)
+        check_range(self, ("lr_lstm",), 0, 1)
+
+    # How it is trained
+
+    @property
+    def cycle(self) -> int:
+        return self.train_interval_rl
+
+    @property
+    def window(self) -> WindowShape:
+        return WindowShape(self.burn_in, self.seq_len)
+
+    @property
+    def pretrain_windows(self) -> int:
+        return self.batch_size
+
+    @property
+    def cycle_windows(self) -> int:
+        return self.batch_size
+
+    @property
+    def lstm_optimiser(self) -> optax.GradientTransformation:
+        return optax.adam(self.lr_lstm)
+
+    def init(self, key: Key[Array, ""], spec: Spec) -> State:
+        key_lstm, key_controller = jax.random.split(key)
+        x = spec.obs_dim + self.perceive_action * spec.action_dim + self.perceive_reward
+        lstm = draw(key_lstm, LSTM(x, self.d_size))
+        controller, controller_optimiser = self.init_controller(key_controller, self.d_size, spec.action_dim)
+        lstm_optimiser = self.lstm_optimiser.init(lstm)  # pyright: ignore[reportArgumentType]
+        return State(lstm, controller, lstm_optimiser, controller_optimiser)
+
+    # Acting
+
+    def perception(self, step: Step) -> Float[Array, "*batch x"]:
+        """o_t, with the action and the reward before it where they are perceived."""
+        parts = [step.obs]
+        if self.perceive_action:
+            parts.append(step.prev_action)
+        if self.perceive_reward:
+            parts.append(step.reward[..., None])
+        return jnp.concatenate(parts, axis=-1)
+
+    def reset(self, spec: Spec) -> LSTMState:
+        return LSTMState(jnp.zeros(self.d_size), jnp.zeros(self.d_size))
+
+    def act(
+        self, state: State, memory: LSTMState, step: Step, key: Key[Array, ""], explore: Bool[Array, ""]
+    ) -> tuple[Float[Array, " action"], LSTMState]:
+        start = jax.tree.map(lambda leaf: leaf[None], memory)
+        after = state.lstm.unroll(start, self.perception(step)[None, None], step.is_first[None, None])
+        memory = jax.tree.map(lambda leaf: leaf[0, 0], after)
+        mean, log_sigma = state.controller.actor(memory.d)
+        noise = jnp.where(explore, jax.random.normal(key, mean.shape), 0.0)
+        return tanh_gaussian(mean, log_sigma, noise)[0], memory
+
+    def note(self, memory: LSTMState) -> tuple[()]:
+        return ()
+
+    # Learning
+
+    def pretrain(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Metrics]:
+        return self.update(state, windows, key)
+
+    def begin_cycle(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Window, Metrics]:
+        """A cycle has one update: its windows."""
+        return state, jax.tree.map(lambda leaf: leaf[None], windows), {}
+
+    def batch(self, lstm: LSTM, windows: Window) -> Batch:
+        """The windows' transitions with their beliefs; no gradient goes into the burn-in nor into targets."""
+        before, after = time_major(windows, 0, self.burn_in), time_major(windows, self.burn_in, None)
+        start = lstm.start(self.batch_size)
+        if self.burn_in:
+            still = jax.lax.stop_gradient(lstm)
+            burnt_in = still.unroll(start, self.perception(before.step), before.step.is_first)
+            start = jax.tree.map(lambda leaf: leaf[-1], burnt_in)
+        step = after.step
+        d = lstm.unroll(start, self.perception(step), step.is_first).d
+        batch = Batch(
+            belief=d[:-1],
+            next_belief=d[1:],
+            action=step.prev_action[1:],
+            reward=step.reward[1:],
+            terminated=step.terminated[1:],
+            valid=transitions(windows, self.burn_in).T,
+        )
+        return jax.tree.map(lambda leaf: leaf[0], split_updates(batch, self.batch_size))
+
+    def update(self, state: State, batch: Window, key: Key[Array, ""]) -> tuple[State, Metrics]:
+        """One update of the LSTM and the controller; the batch is windows."""
+
+        def loss(lstm: LSTM, controller: Controller) -> tuple[Float[Array, ""], Metrics]:
+            return self.controller_loss(controller, self.batch(lstm, batch), key)
+
+        (by_lstm, by_controller), metrics = jax.grad(loss, (0, 1), has_aux=True)(state.lstm, state.controller)
+        lstm, lstm_optimiser = descend(self.lstm_optimiser, by_lstm, state.lstm_optimiser, state.lstm)
+        controller, controller_optimiser = update(
+            self.optimisers, state.controller_optimiser, state.controller, by_controller, self.tau
+        )
+        return State(lstm, controller, lstm_optimiser, controller_optimiser), metrics

@@ -1,0 +1,208 @@
+"""SLAC: critics on the latent state of a learned model, an actor on the last observations (Lee et al. 2019).
+
+Source: Lee et al. 2019, Sections 4 and 5; Han, Doya, Tani 2020, Section 5 and Appendix A.2.3. The model
+(`latent_model`) is pre-trained and then learns at every step. Q and V read z²_t, the actor the last eight
+x_t = (o_t, r_{t-1}), in which an episode's first stands for what was before it.
+
+Departures: z²_t is inferred from four moments before a sampled sequence on, so that the critics' beliefs rest on 5 to
+12 moments; Lee et al. take one transition from each sequence, behind 8. The beliefs of an update are inferred with the
+model as it was before its own update of that step, so that the two can run side by side. Those of the model itself
+are in `latent_model`.
+"""
+
+import dataclasses
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Key
+
+from beliefrl.agents.sac import SAC, Metrics, split_updates
+from beliefrl.latent_model import LatentModel, Latents, elbo_terms
+from beliefrl.nets import descend, draw, tanh_gaussian
+from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean
+from beliefrl.types import (
+    Spec,
+    Step,
+    UserError,
+    Window,
+    WindowShape,
+    check_choice,
+    check_range,
+    perception,
+    time_major,
+    transitions,
+)
+
+
+class State(NamedTuple):
+    """Everything that training changes."""
+
+    model: LatentModel
+    controller: Controller
+    model_optimiser: optax.OptState
+    controller_optimiser: OptimiserState
+
+
+@dataclasses.dataclass(frozen=True)
+class SLACAgent(SAC):
+    """Critics on the latent state of a learned model, an actor on the last eight observations (Lee et al. 2019)."""
+
+    seq_len: int = 8
+    """Steps in a sampled sequence (Lee et al. 2019)."""
+    batch_size: int = 32
+    """Sequences in an update (Lee et al. 2019)."""
+    history: int = 8
+    """Observations and rewards that the actor reads (Lee et al. 2019)."""
+    z1_size: int = 32
+    """Size of the latent variable z¹ (Lee et al. 2019)."""
+    z2_size: int = 256
+    """Size of the latent variable z² (Lee et al. 2019)."""
+    model_layers: tuple[int, ...] = (256, 256)
+    """Hidden layers of every network of the model (Appendix A.2.3)."""
+    lr_model: float = 1e-4
+    """Adam's learning rate for the model (Lee et al. 2019)."""
+    train_interval_model: int = 1
+    """Environment steps between two updates of the model (Lee et al. 2019)."""
+    pretrain_updates: int = 5000
+    """Updates of the model at step_start_rl, as many as VRM's pre-training has (Section 5; 0 is off)."""
+    elbo_scaling: Literal["mean", "sum"] = "mean"
+    """Mean (the authors' code) or sum (the formula) over the dimensions of z¹, and of observation and reward."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible values with a UserError."""
+        super().__post_init__()
+        sizes = ("seq_len", "batch_size", "history", "z1_size", "z2_size", "model_layers", "train_interval_model")
+        check_range(self, sizes, 1)
+        check_range(self, ("pretrain_updates",), 0)
+        check_range(self, ("lr_model",), 0, 1)
+        check_choice(self, "elbo_scaling", ("mean", "sum"))
+        if self.train_interval_model % self.train_interval_rl:
+            raise UserError(
+                f"train_interval_model={self.train_interval_model} is not a multiple of "
+                f"train_interval_rl={self.train_interval_rl}: choose one that is."
+            )
+
+    # How it is trained
+
+    @property
+    def cycle(self) -> int:
+        return self.train_interval_model
+
+    @property
+    def window(self) -> WindowShape:
+        return WindowShape(self.history - 1, self.seq_len)
+
+    @property
+    def pretrain_windows(self) -> int:
+        return self.batch_size
+
+    @property
+    def cycle_windows(self) -> int:
+        """One batch for the model and one for each update of the controller."""
+        return self.batch_size * (1 + self.cycle // self.train_interval_rl)
+
+    @property
+    def model_optimiser(self) -> optax.GradientTransformation:
+        return optax.adam(self.lr_model)
+
+    def init(self, key: Key[Array, ""], spec: Spec) -> State:
+        key_model, key_controller = jax.random.split(key)
+        sizes = (spec.obs_dim, spec.action_dim, self.z1_size, self.z2_size)
+        model = draw(key_model, LatentModel(*sizes, self.model_layers))
+        seen = self.history * (spec.obs_dim + 1)
+        controller, controller_optimiser = self.init_controller(key_controller, self.z2_size, spec.action_dim, seen)
+        model_optimiser = self.model_optimiser.init(model)  # pyright: ignore[reportArgumentType]
+        return State(model, controller, model_optimiser, controller_optimiser)
+
+    # Acting
+
+    def reset(self, spec: Spec) -> Float[Array, "history x"]:
+        return jnp.zeros((self.history, spec.obs_dim + 1))
+
+    def act(
+        self, state: State, memory: Float[Array, "history x"], step: Step, key: Key[Array, ""], explore: Bool[Array, ""]
+    ) -> tuple[Float[Array, " action"], Float[Array, "history x"]]:
+        x = perception(step)
+        memory = jnp.where(step.is_first, x[None], jnp.concatenate([memory[1:], x[None]]))
+        mean, log_sigma = state.controller.actor(memory.ravel())
+        noise = jnp.where(explore, jax.random.normal(key, mean.shape), 0.0)
+        return tanh_gaussian(mean, log_sigma, noise)[0], memory
+
+    def note(self, memory: Float[Array, "history x"]) -> tuple[()]:
+        return ()
+
+    # Learning the model
+
+    def pretrain(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Metrics]:
+        gradient, metrics = jax.grad(self.model_loss, has_aux=True)(state.model, windows, key)
+        model, optimiser = descend(self.model_optimiser, gradient, state.model_optimiser, state.model)
+        return state._replace(model=model, model_optimiser=optimiser), metrics
+
+    def model_loss(self, model: LatentModel, windows: Window, key: Key[Array, ""]) -> tuple[Float[Array, ""], Metrics]:
+        """The negative ELBO, mean over the valid moments of the sequences."""
+        moments = begin_windows(time_major(windows, self.history - 1, -1))
+        step = moments.step
+        latents = self.infer(model, moments, key)
+        terms = elbo_terms(model, latents, step.obs, step.reward, step.prev_action, step.is_first)
+        kl, log_obs, log_reward = (valid_mean(term.ravel(), moments.exists.ravel()) for term in terms)
+        log_likelihood = log_obs + log_reward
+        if self.elbo_scaling == "mean":
+            kl, log_likelihood = kl / self.z1_size, log_likelihood / (step.obs.shape[-1] + 1)
+        metrics = {"kl": kl, "log_likelihood": log_likelihood, "negative_elbo": kl - log_likelihood}
+        return kl - log_likelihood, metrics
+
+    def infer(self, model: LatentModel, moments: Window, key: Key[Array, ""]) -> Latents:
+        """The latent variables at moments (time-major)."""
+        key1, key2 = jax.random.split(key)
+        shape, step = moments.exists.shape, moments.step
+        noise = jax.random.normal(key1, (*shape, self.z1_size)), jax.random.normal(key2, (*shape, self.z2_size))
+        return model.infer(perception(step), step.prev_action, step.is_first, noise)
+
+    # Learning the controller
+
+    def begin_cycle(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Batch, Metrics]:
+        key_model, key_belief = jax.random.split(key)
+        for_model = jax.tree.map(lambda leaf: leaf[: self.batch_size], windows)
+        for_controller = jax.tree.map(lambda leaf: leaf[self.batch_size :], windows)
+        batches = self.batches(state.model, for_controller, key_belief)
+        state, metrics = self.pretrain(state, for_model, key_model)
+        return state, batches, metrics
+
+    def batches(self, model: LatentModel, windows: Window, key: Key[Array, ""]) -> Batch:
+        """The windows' transitions with their beliefs, split for a cycle's updates: leaves (update, batch, ...)."""
+        step, burn_in, context = time_major(windows, 0, None).step, self.window.burn_in, self.history // 2
+        inferred = begin_windows(time_major(windows, burn_in - context, None))
+        belief = self.infer(model, inferred, key).z2[context:]
+        after = slice(burn_in + 1, None)
+        batch = Batch(
+            belief=belief[:-1],
+            next_belief=belief[1:],
+            action=step.prev_action[after],
+            reward=step.reward[after],
+            terminated=step.terminated[after],
+            valid=transitions(windows, burn_in).T,
+            seen=self.histories(step)[:-1],
+        )
+        return split_updates(batch, self.batch_size)
+
+    def histories(self, step: Step) -> Float[Array, "length batch seen"]:
+        """What the actor read at each moment after the burn-in of windows (time-major)."""
+        x, time = perception(step), jnp.arange(step.reward.shape[0])
+        begun = jax.lax.cummax(jnp.where(step.is_first, time[:, None], 0))  # when the moment's episode began
+        back = time[self.history - 1 :, None] - jnp.arange(self.history)[::-1][None]
+        index = jnp.maximum(back[:, :, None], begun[self.history - 1 :, None])  # (length, history, batch)
+        seen = x[index, jnp.arange(x.shape[1])].swapaxes(1, 2)
+        return seen.reshape(*seen.shape[:2], -1)
+
+    def update(self, state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
+        controller, optimiser, metrics = self.learn_controller(state.controller, state.controller_optimiser, batch, key)
+        return state._replace(controller=controller, controller_optimiser=optimiser), metrics
+
+
+def begin_windows(moments: Window) -> Window:
+    """Windows (time-major) whose first moment counts as an episode's first: nothing was before it."""
+    step = moments.step
+    step = step._replace(is_first=step.is_first.at[0].set(True), prev_action=step.prev_action.at[0].set(0.0))
+    return moments._replace(step=step)
