@@ -10,6 +10,7 @@ import pytest
 from beliefrl import cli, tasks
 
 TRAIN = "train vrm pendulum-v"
+AGENTS = {"vrm", "sac-mlp", "sac-lstm", "slac", "vrm-single", "vrm-first", "vrm-keep", "vrm-deterministic"}
 TASKS = {"pendulum", "pendulum-v", "pendulum-p", "cartpole", "cartpole-v", "cartpole-p", "target-reaching"}
 
 
@@ -36,7 +37,7 @@ def test_the_help_of_training_shows_hyperparameters_and_where_they_stand(capsys)
 
 def test_tasks_and_agents_are_listed_one_a_line(capsys):
     assert {line.split()[0] for line in printed(capsys, "tasks").splitlines()} == TASKS
-    assert [line.split()[0] for line in printed(capsys, "agents").splitlines()] == ["vrm"]
+    assert {line.split()[0] for line in printed(capsys, "agents").splitlines()} == AGENTS
 
 
 def test_version(capsys):
@@ -75,6 +76,10 @@ MISTAKES = {
     f"{TRAIN} --actor-regulariser inf": "actor_regulariser=inf is impossible",
     f"{TRAIN} --policy-layers 0": "policy_layers=(0,) is impossible",
     f"{TRAIN} --policy-layers": "policy_layers=() is impossible",
+    "train slac pendulum-v --history 0": "history=0 is impossible",
+    "train sac-lstm pendulum-v --burn-in -1": "burn_in=-1 is impossible",
+    "train sac-mlp pendulum-v --seq-len 4": "There is no option --seq-len",
+    f"{TRAIN} --models three": "--models must be one of 'both', 'single', 'first', 'keep', not 'three'",
     f"{TRAIN} --elbo-scaling foo": "--elbo-scaling must be one of 'mean', 'sum', not 'foo'",
     f"{TRAIN} --train-interval-rl 3": "train_interval_klvrm=5 is not a multiple of train_interval_rl=3",
     f"{TRAIN} --replay-capacity 10": "replay_capacity=10 is too small: this agent needs at least 2000",

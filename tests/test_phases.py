@@ -8,21 +8,19 @@ import pytest
 from beliefrl import agents, phases, tasks
 from worlds import Counting, CountingAgent
 
+SHARED = {"step_start_rl": 20, "policy_layers": (8,), "value_layers": (8,)}
+MODELS = {"train_times_fivrm": 10, "d_size": 8, "z_size": 4, "hidden_size": 8}
+SEQUENCES = {"seq_len": 8, "burn_in": 4, "batch_size": 2}
 SMALL = {
-    "step_start_rl": 20,
-    "train_times_fivrm": 10,
-    "seq_len": 8,
-    "burn_in": 4,
-    "batch_size": 2,
-    "d_size": 8,
-    "z_size": 4,
-    "hidden_size": 8,
-    "policy_layers": (8,),
-    "value_layers": (8,),
+    "vrm": MODELS | SEQUENCES,
+    "vrm-single": MODELS | SEQUENCES,
+    "sac-mlp": {"batch_size": 8, "pretrain_updates": 10},
+    "sac-lstm": {"d_size": 8, "pretrain_updates": 10} | SEQUENCES,
+    "slac": {"z1_size": 2, "z2_size": 4, "model_layers": (8,), "batch_size": 2, "pretrain_updates": 10},
 }
 
 
-def trained(program, keys, cuts=(10, 10), learn=(2, 3)):
+def trained(program, keys, cuts=(10, 10), learn=(10, 15), cycle=5):
     """Explore, pre-train, relive and learn, in stretches of these lengths."""
     seeds, step, told = program.begin(keys), 0, []
     for steps in cuts:
@@ -30,17 +28,21 @@ def trained(program, keys, cuts=(10, 10), learn=(2, 3)):
         step += steps
     seeds, _ = program.pretrain(seeds, 0, 10)
     seeds = program.relive(seeds)
-    for cycles in learn:
-        seeds, stretch = program.learn(seeds, step, cycles)
+    for steps in learn:
+        seeds, stretch = program.learn(seeds, step, steps // cycle)
         told.append(jax.tree.map(np.asarray, stretch))
-        step += 5 * cycles
+        step += steps
     return seeds, told
 
 
-@pytest.fixture(scope="module")
-def small():
-    agent, task = agents.make("vrm", **SMALL), tasks.make("pendulum-p", max_steps=9)
-    return phases.compile_program(agent, task, capacity=200, episodes=2)
+@pytest.fixture(
+    scope="module",
+    params=[name if name in ("vrm", "sac-mlp") else pytest.param(name, marks=pytest.mark.slow) for name in SMALL],
+)
+def small(request):
+    """A small agent's training program and its agent's cycle."""
+    agent, task = agents.make(request.param, **SHARED, **SMALL[request.param]), tasks.make("pendulum-p", max_steps=9)
+    return phases.compile_program(agent, task, capacity=200, episodes=2), agent.cycle
 
 
 def leaves(tree):
@@ -51,9 +53,10 @@ def leaves(tree):
 
 
 def test_a_seed_among_others_learns_as_it_does_alone(small):
+    program, cycle = small
     keys = jax.random.split(jax.random.key(0), 3)
-    together, told = trained(small, keys)
-    alone, told_alone = trained(small, keys[1:2])
+    together, told = trained(program, keys, cycle=cycle)
+    alone, told_alone = trained(program, keys[1:2], cycle=cycle)
     for ours, theirs in zip(leaves(together), leaves(alone), strict=True):
         np.testing.assert_allclose(ours[1], theirs[0], rtol=1e-4, atol=1e-5)
     for name, values in told[-1].metrics.items():
@@ -62,9 +65,10 @@ def test_a_seed_among_others_learns_as_it_does_alone(small):
 
 
 def test_no_result_depends_on_where_the_training_is_cut(small):
-    keys = jax.random.split(jax.random.key(1), 1)
-    one, _ = trained(small, keys, cuts=(20,), learn=(5,))
-    other, _ = trained(small, keys, cuts=(7, 12, 1), learn=(1, 3, 1))
+    program, cycle = small
+    keys = jax.random.split(jax.random.key(0), 1)
+    one, _ = trained(program, keys, cuts=(20,), learn=(25,), cycle=cycle)
+    other, _ = trained(program, keys, cuts=(7, 12, 1), learn=(5, 15, 5), cycle=cycle)
     for ours, theirs in zip(leaves(one), leaves(other), strict=True):
         np.testing.assert_array_equal(ours, theirs)
 

@@ -1,18 +1,17 @@
 """The command line: parses, calls, prints. `beliefrl --help` shows the commands."""
 
-import contextlib
 import dataclasses
 import difflib
-import io
 import json
 import pathlib
-import re
 import sys
 import time
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any, NoReturn
 
 import tyro
+
+from beliefrl.arguments import UsageError, agent_name, agent_options, parse
 
 STARTED = time.time()
 
@@ -24,7 +23,7 @@ Reinforcement learning for agents that do not see the whole state.
   beliefrl evaluate RUN         play new episodes with what a run has learned
   beliefrl tasks                list the tasks
   beliefrl agents               list the agents
-  beliefrl bench AGENT          time a training step on this machine, part by part
+  beliefrl bench AGENT          time a training step on this machine, part by part; `all` compares the agents
   beliefrl --version            print the version
 
 for example
@@ -39,10 +38,6 @@ with their defaults and where in the paper they stand.
 A run's folder holds config.json, metrics/ (a line of JSON for every entry), tensorboard/, the trained agents,
 results.json and curve.png. Mistakes end with one sentence and exit code 2.
 """
-
-
-class UsageError(Exception):
-    """A mistake on the command line, as a sentence."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,14 +59,6 @@ class ListOptions:
     """Print the names, one a line."""
 
 
-def _agent_options(agent: Any, own: dict[str, Any]) -> type:
-    """The options of a command on an agent: its own, (type, default) each, and the agent's hyperparameters."""
-    fields = [(name, kind, dataclasses.field(default=default)) for name, (kind, default) in own.items()]
-    hyperparameters = Annotated[type(agent), tyro.conf.arg(name="", help="Hyperparameters of the agent.")]
-    fields.append(("agent", hyperparameters, dataclasses.field(default=agent)))
-    return dataclasses.make_dataclass("Options", fields, frozen=True)
-
-
 def train(argv: Sequence[str]) -> None:
     """`beliefrl train AGENT TASK ...`."""
     from rich.console import Console
@@ -81,8 +68,8 @@ def train(argv: Sequence[str]) -> None:
     from beliefrl.train import Options
     from beliefrl.train import train as run_training
 
-    name, rest = _agent_name(argv, "train", "TASK")
-    options_type = _agent_options(
+    name, rest = agent_name(argv, "train", "TASK")
+    options_type = agent_options(
         agents.find(name),
         {
             "task": (
@@ -101,7 +88,7 @@ def train(argv: Sequence[str]) -> None:
             ),
         },
     )
-    options = _parse(options_type, rest, f"beliefrl train {name}")
+    options = parse(options_type, rest, f"beliefrl train {name}")
     task = tasks.make(options.task)
     console = Console()
     with TrainingDisplay(console, options.training.steps) as display:
@@ -115,7 +102,7 @@ def train(argv: Sequence[str]) -> None:
 
 def evaluate(argv: Sequence[str]) -> None:
     """`beliefrl evaluate RUN ...`."""
-    options = _parse(EvaluateOptions, argv, "beliefrl evaluate")
+    options = parse(EvaluateOptions, argv, "beliefrl evaluate")
     from rich.console import Console
 
     from beliefrl.display import results_table
@@ -133,7 +120,7 @@ def evaluate(argv: Sequence[str]) -> None:
 
 def list_tasks(argv: Sequence[str]) -> None:
     """`beliefrl tasks`."""
-    _parse(ListOptions, argv, "beliefrl tasks")
+    parse(ListOptions, argv, "beliefrl tasks")
     from beliefrl import tasks
 
     _print_names(tasks.names())
@@ -141,17 +128,17 @@ def list_tasks(argv: Sequence[str]) -> None:
 
 def list_agents(argv: Sequence[str]) -> None:
     """`beliefrl agents`."""
-    _parse(ListOptions, argv, "beliefrl agents")
+    parse(ListOptions, argv, "beliefrl agents")
     from beliefrl import agents
 
     _print_names(agents.names())
 
 
 def bench(argv: Sequence[str]) -> None:
-    """`beliefrl bench AGENT ...`."""
+    """`beliefrl bench AGENT ...`, `beliefrl bench all ...`."""
     from beliefrl import agents
 
-    name, rest = _agent_name(argv, "bench")
+    name, rest = agent_name(argv, "bench")
 
     def option(kind: Any, default: Any, help: str) -> tuple[Any, Any]:
         return Annotated[kind, tyro.conf.arg(help=help)], default
@@ -162,15 +149,25 @@ def bench(argv: Sequence[str]) -> None:
         "seeds": option(int, 1, "Seeds trained side by side in one program."),
         "json": option(bool, False, "Print one JSON object."),
     }
-    options = _parse(_agent_options(agents.find(name), own), rest, f"beliefrl bench {name}")
+    options = parse(agent_options(None if name == "all" else agents.find(name), own), rest, f"beliefrl bench {name}")
     from beliefrl.bench import bench as run_bench
 
-    result = run_bench(options.agent, options.obs, options.actions, options.seeds, STARTED)
+    sizes = (options.obs, options.actions, options.seeds)
+    if name == "all":
+        results = {each: run_bench(agents.make(each), *sizes) for each in agents.names()}
+    else:
+        results = run_bench(options.agent, *sizes, STARTED)
     if options.json:
-        print(json.dumps(result))
-        return
-    for key, value in result.items():
-        print(f"{key:<28}{value:,.3f}" if isinstance(value, float) else f"{key:<28}{value}")
+        print(json.dumps(results))
+    elif name == "all":
+        from rich.console import Console
+
+        from beliefrl.display import scalability_table
+
+        Console().print(scalability_table(results, options.obs, options.actions))
+    else:
+        for key, value in results.items():
+            print(f"{key:<28}{value:,.3f}" if isinstance(value, float) else f"{key:<28}{value}")
 
 
 COMMANDS: dict[str, Callable[[Sequence[str]], None]] = {
@@ -186,72 +183,6 @@ def _print_names(names: dict[str, str]) -> None:
     width = max(map(len, names)) + 2
     for name, about in names.items():
         print(f"{name:<{width}}{about}")
-
-
-def _agent_name(argv: Sequence[str], command: str, more: str = "") -> tuple[str, Sequence[str]]:
-    """The agent's name and what follows it."""
-    usage = f"beliefrl {command} AGENT {more}".rstrip()
-    if argv and argv[0] in ("-h", "--help"):
-        print(f"usage: {usage} ...\n")
-        print(f"`beliefrl agents` lists the agents; name one to see its options: beliefrl {command} vrm --help")
-        raise SystemExit(0)
-    if not argv or argv[0].startswith("-"):
-        raise UsageError(f"No agent is named: write {usage}; `beliefrl agents` lists them.")
-    return argv[0], argv[1:]
-
-
-def _parse(options: Any, argv: Sequence[str], prog: str) -> Any:
-    """Options from the command line; a mistake becomes a sentence instead of tyro's box."""
-    if any(arg in ("-h", "--help") for arg in argv):
-        return tyro.cli(options, prog=prog, args=argv)
-    box = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(box), contextlib.redirect_stdout(box):
-            parsed, unknown = tyro.cli(options, prog=prog, args=argv, return_unknown_args=True)
-    except SystemExit:
-        raise UsageError(f"{_sentence(box.getvalue())}; `{prog} --help` shows what can be given.") from None
-    if unknown:
-        raise UsageError(_unknown(options, unknown[0], prog))
-    return parsed
-
-
-WORDING = (  # tyro's, Python's, and ours
-    (r"Missing from .*: (\w+) .*", r"\1 is missing"),
-    (r"Error parsing (\S+): invalid literal for int\(\) with base 10: (.*)", r"\1 must be a whole number, not \2"),
-    (r"Error parsing (\S+): could not convert string to float: (.*)", r"\1 must be a number, not \2"),
-    (r"Error parsing (\S+): .* \[(.*)\]", r"\1 cannot be \2"),
-    (r"invalid choice (.*) for argument '(\S+)'. Expected one of \((.*)\)", r"\2 must be one of \3, not \1"),
-    (r"Missing value for argument '(\S+)'.*", r"\1 needs a value"),
-)
-
-
-def _sentence(box: str) -> str:
-    """The first paragraph below the title of a box that tyro drew, on one line and in our words."""
-    lines = [line.strip(" │|╭╮╰╯─-") for line in box.splitlines()[1:]]  # rules become empty
-    paragraphs = " ".join(line or "\n" for line in lines).split("\n")
-    message = next(filter(str.strip, paragraphs), "That command line cannot be understood").strip().rstrip(".")
-    for theirs, ours in WORDING:
-        message = re.sub(f"^{theirs}$", ours, message)
-    return message
-
-
-def _unknown(options: Any, given: str, prog: str) -> str:
-    """What to say of an argument that no option takes."""
-    if not given.startswith("-"):
-        return f"There is one argument too many, {given!r}: `{prog} --help` shows what can be given."
-    names = [f"--{name.replace('_', '-')}" for name in _option_names(options)]
-    near = difflib.get_close_matches(given.split("=")[0], names, n=1)
-    hint = f"did you mean {near[0]}?" if near else f"`{prog} --help` shows them."
-    return f"There is no option {given}: {hint}"
-
-
-def _option_names(options: Any) -> list[str]:
-    """Every field of a dataclass and of the dataclasses in it."""
-    names = []
-    for field in dataclasses.fields(options):
-        kind = getattr(field.type, "__origin__", field.type)
-        names += _option_names(kind) if dataclasses.is_dataclass(kind) else [field.name]
-    return names
 
 
 def _fail(message: str) -> NoReturn:

@@ -113,5 +113,17 @@ def results_table(results: dict[str, Any], seeds: list[int], title: str) -> Tabl
     return table
 
 
+def scalability_table(results: dict[str, dict[str, Any]], obs: int, actions: int) -> Table:
+    """What each agent costs: the paper's scalability table (Appendix G), of this machine."""
+    table = Table(title=f"{obs} observations, {actions} actions", title_justify="left")
+    for heading in ("agent", "ms a step", "100,000 steps", "parameters", "share of matrix peak"):
+        table.add_column(heading, justify="left" if heading == "agent" else "right")
+    for name, result in results.items():
+        milliseconds, share = result["ms_per_step"], result["share_of_peak"]
+        numbers = (f"{milliseconds:.1f}", duration(100 * milliseconds), f"{result['parameters']:,}", f"{share:.0%}")
+        table.add_row(name, *numbers)
+    return table
+
+
 def _mean(mode: dict[str, Any]) -> str:
     return f"{mode['mean']:.1f}" + (f" ± {mode['sem']:.1f}" if mode["sem"] is not None else "")

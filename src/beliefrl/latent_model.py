@@ -44,7 +44,7 @@ class GaussianMLP(eqx.Module):
         self.mlp = MLP((inputs, *layers, 2 * outputs), jnp.tanh)
         self.least = least
 
-    def __call__(self, *inputs: Float[Array, "*batch part"]) -> Gaussian:
+    def __call__(self, *inputs: Float[Array, "*batch _"]) -> Gaussian:
         """The Gaussian for inputs given in parts, each (*batch, size)."""
         first = self.mlp.layers[0]
         return self.rest(_add(jnp.concatenate(inputs, axis=-1) @ first.weight.T, first.bias))[0]
@@ -64,7 +64,7 @@ class GaussianMLP(eqx.Module):
         mean, sigma = jnp.split(x, 2, axis=-1)
         return Gaussian(mean, jax.nn.softplus(sigma) + self.least), tuple(inputs)
 
-    def columns(self, *sizes: int) -> list[Float[Array, "part hidden"]]:
+    def columns(self, *sizes: int) -> list[Float[Array, "_ hidden"]]:
         """The first layer's weights taken apart by the inputs' sizes, input by output."""
         return jnp.split(self.mlp.layers[0].weight.T, list(itertools.accumulate(sizes))[:-1])
 

@@ -142,13 +142,16 @@ class SACLSTMAgent(SAC):
         )
         return jax.tree.map(lambda leaf: leaf[0], split_updates(batch, self.batch_size))
 
+    def loss(
+        self, lstm: LSTM, controller: Controller, windows: Window, key: Key[Array, ""]
+    ) -> tuple[Float[Array, ""], Metrics]:
+        """The controller's losses on the beliefs that the LSTM forms."""
+        return self.controller_loss(controller, self.batch(lstm, windows), key)
+
     def update(self, state: State, batch: Window, key: Key[Array, ""]) -> tuple[State, Metrics]:
         """One update of the LSTM and the controller; the batch is windows."""
-
-        def loss(lstm: LSTM, controller: Controller) -> tuple[Float[Array, ""], Metrics]:
-            return self.controller_loss(controller, self.batch(lstm, batch), key)
-
-        (by_lstm, by_controller), metrics = jax.grad(loss, (0, 1), has_aux=True)(state.lstm, state.controller)
+        gradient = jax.grad(self.loss, (0, 1), has_aux=True)
+        (by_lstm, by_controller), metrics = gradient(state.lstm, state.controller, batch, key)
         lstm, lstm_optimiser = descend(self.lstm_optimiser, by_lstm, state.lstm_optimiser, state.lstm)
         controller, controller_optimiser = update(
             self.optimisers, state.controller_optimiser, state.controller, by_controller, self.tau

@@ -29,7 +29,7 @@ class SACMLPAgent(SAC):
     """Soft actor-critic on the observation alone, without memory (Haarnoja et al. 2018)."""
 
     batch_size: int = 256
-    """Transitions in an update (Appendix E: as many as the other agents')."""
+    """Transitions in an update (Appendix F: as many as the other agents')."""
     pretrain_updates: int = 5000
     """Updates of the controller at step_start_rl, as many as VRM's pre-training has (Section 5; 0 is off)."""
 

@@ -1,0 +1,71 @@
+"""Random windows for agents to learn from."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from beliefrl.types import Spec, Step, Window
+
+SPEC = Spec(obs_dim=3, action_dim=2, max_steps=50)
+
+
+def windows(key, batch, time, is_first=None, exists=None):
+    """Random windows of `time` moments that begin at an episode's first, where nothing else is said."""
+    keys = jax.random.split(key, 3)
+    none = jnp.zeros((batch, time), bool)
+    is_first = none.at[:, 0].set(True) if is_first is None else is_first
+    action = jnp.tanh(jax.random.normal(keys[2], (batch, time, SPEC.action_dim)))
+    step = Step(
+        jax.random.normal(keys[0], (batch, time, SPEC.obs_dim)),
+        jnp.where(is_first, 0.0, jax.random.normal(keys[1], (batch, time))),
+        jnp.where(is_first[..., None], 0.0, action),
+        is_first,
+        none,
+    )
+    return Window(step, (), ~none if exists is None else exists)
+
+
+def same(a, b):
+    """Whether two trees are equal to the last bit."""
+    return all(jax.tree.leaves(jax.tree.map(lambda x, y: bool(np.all(np.asarray(x) == np.asarray(y))), a, b)))
+
+
+def differ(a, b):
+    """Whether every array of two trees differs."""
+    return all(jax.tree.leaves(jax.tree.map(lambda x, y: bool(np.any(np.asarray(x) != np.asarray(y))), a, b)))
+
+
+def changed_where_missing(agent, state, window, exists):
+    """What a cycle and its updates make of windows, and of the same with other moments where none exist."""
+    other = windows(jax.random.key(9), *exists.shape)
+    changed = jax.tree.map(
+        lambda a, b: jnp.where(exists.reshape(exists.shape + (1,) * (a.ndim - 2)), a, b),
+        window._replace(exists=exists),
+        other._replace(exists=exists),
+    )
+    results = []
+    for given in (window._replace(exists=exists), changed):
+        after, batches, metrics = jax.jit(agent.begin_cycle)(state, given, jax.random.key(2))
+        after, more = jax.jit(agent.update)(after, jax.tree.map(lambda leaf: leaf[0], batches), jax.random.key(3))
+        results.append((after, metrics | more))
+    return results
+
+
+def slope(function, at, direction, by=1e-2):
+    """The derivative of a function of a tree along a direction, by central differences."""
+    ahead, behind = (
+        function(jax.tree.map(lambda x, d, sign=sign: x + sign * by * d, at, direction)) for sign in (1, -1)
+    )
+    return float((ahead - behind) / (2 * by))
+
+
+def random_like(tree, key):
+    """Standard normal numbers in the shape of a tree."""
+    leaves, structure = jax.tree.flatten(tree)
+    keys = jax.random.split(key, len(leaves))
+    return structure.unflatten([jax.random.normal(k, leaf.shape) for k, leaf in zip(keys, leaves, strict=True)])
+
+
+def along(gradient, direction):
+    """A gradient's slope along a direction."""
+    return float(sum(jax.tree.leaves(jax.tree.map(lambda g, d: jnp.sum(g * d), gradient, direction))))

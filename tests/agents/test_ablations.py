@@ -1,0 +1,136 @@
+"""The four ablations of VRM: which models there are, which of them learn when, and the deterministic model."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from agents.moments import SPEC, along, random_like, same, slope, windows
+from beliefrl import agents
+from beliefrl.types import UserError, perception, time_major
+
+SMALL = {
+    "d_size": 8,
+    "z_size": 4,
+    "hidden_size": 8,
+    "policy_layers": (8, 8),
+    "value_layers": (8, 8),
+    "seq_len": 6,
+    "batch_size": 2,
+    "burn_in": 4,
+}
+MODELS = {"vrm": "first keep", "vrm-single": "keep", "vrm-first": "first", "vrm-keep": "keep"}
+
+
+def made(name):
+    """A small agent, its state, and its windows with the notes it would have made."""
+    agent = agents.make(name, **SMALL)
+    state = jax.jit(lambda key: agent.init(key, SPEC))(jax.random.key(0))
+    window = windows(jax.random.key(1), agent.cycle_windows, 11)
+    notes = jax.vmap(jax.vmap(lambda _: agent.note(agent.reset(SPEC))))(window.exists)
+    return agent, state, window._replace(note=notes)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_it_has_its_models_and_each_learns_in_its_time(name):
+    agent, state, window = made(name)
+    there = MODELS[name].split()
+    assert [part for part in ("first", "keep") if getattr(state, part) is not None] == there
+    assert state.controller.value.layers[0].weight.shape[1] == len(there) * 8 + 4
+    assert (agent.pretrain_updates > 0) == (name != "vrm-keep")
+
+    if agent.pretrain_updates:
+        part = jax.tree.map(lambda leaf: leaf[:2], window)
+        after, metrics = jax.jit(agent.pretrain)(state, part, jax.random.key(2))
+        learned = [part for part in ("first", "keep") if not same(getattr(after, part), getattr(state, part))]
+        assert learned == there[:1]
+        assert metrics["negative_elbo"]
+    after, batches, metrics = jax.jit(agent.begin_cycle)(state, window, jax.random.key(2))
+    assert same(after.first, state.first)
+    assert ("keep" in there) == (not same(after.keep, state.keep)) == bool(metrics)
+    assert batches.belief.shape == (5, 12, len(there) * 8 + 4)
+    updated, _ = jax.jit(agent.update)(after, jax.tree.map(lambda leaf: leaf[0], batches), jax.random.key(3))
+    assert same((updated.first, updated.keep), (after.first, after.keep))
+
+
+@pytest.mark.parametrize("name", ["vrm-single", "vrm-first"])
+def test_acting_forms_the_belief_that_replay_forms(name):
+    agent, state, window = made(name)
+    agent = dataclasses.replace(agent, store_first_impression=False, deterministic=True)
+    state = jax.jit(lambda key: agent.init(key, SPEC))(jax.random.key(0))
+    windowed = jax.tree.map(lambda leaf: leaf[:10], window)._replace(note=())
+    batch = jax.jit(agent.batches)(state, windowed, jax.random.key(2))
+    memory, act = agent.reset(SPEC), jax.jit(agent.act)
+    for t in range(11):
+        step = jax.tree.map(lambda leaf, t=t: leaf[0, t], windowed.step)
+        _, memory = act(state, memory, step, jax.random.key(t), jnp.array(True))
+        if t == agent.burn_in:
+            d = (memory.first or memory.keep).d
+            np.testing.assert_allclose(batch.belief[0, 0, :8], d, rtol=1e-5, atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def deterministic():
+    return made("vrm-deterministic")
+
+
+def test_a_deterministic_model_predicts_before_it_sees(deterministic):
+    """z_t and the prediction of x_t come from d_{t-1} and a_{t-1}; x_t enters d_t. No key changes anything."""
+    _, state, window = deterministic
+    moments = time_major(window, 0, None)
+    changed = moments.step._replace(obs=moments.step.obs.at[5].add(1.0))
+
+    @jax.jit
+    def infer(step, key):
+        vrm = state.keep
+        noise = jax.random.normal(key, (*step.reward.shape, 4))
+        return vrm.infer(vrm.start(noise.shape[1]), perception(step), step.prev_action, step.is_first, noise)
+
+    one, other = infer(moments.step, jax.random.key(1)), infer(changed, jax.random.key(2))
+    np.testing.assert_allclose(one.z[:6], other.z[:6], rtol=1e-6)
+    np.testing.assert_allclose(one.state.d[:5], other.state.d[:5], rtol=1e-6)
+    assert not np.allclose(one.state.d[5], other.state.d[5])
+    assert not np.allclose(one.z[6], other.z[6])
+
+
+def test_a_deterministic_models_loss_is_its_mean_squared_error(deterministic):
+    agent, state, window = deterministic
+    window = jax.tree.map(lambda leaf: leaf[:2], window)
+    vrm, moments = state.keep, time_major(window, 0, -1)
+    step = moments.step
+
+    @jax.jit
+    def predicted():
+        noise = jnp.zeros((10, 2, 4))
+        inferred = vrm.infer(vrm.start(2), perception(step), step.prev_action, step.is_first, noise)
+        return jax.vmap(jax.vmap(vrm.decode))(inferred.before, inferred.z).mean
+
+    error = np.mean((np.asarray(predicted()) - np.asarray(perception(step)))[4:] ** 2)
+    loss, metrics = jax.jit(agent.model_loss)(vrm, window, jax.random.key(2))
+    assert float(loss) == pytest.approx(error, rel=1e-5)
+    assert set(metrics) == {"prediction_error"}
+
+
+def test_a_deterministic_models_gradient_agrees_with_finite_differences(deterministic):
+    agent, state, window = deterministic
+    agent = dataclasses.replace(agent, burn_in=0, seq_len=10)
+    window = jax.tree.map(lambda leaf: leaf[:2], window)
+    loss = jax.jit(lambda vrm: agent.model_loss(vrm, window, jax.random.key(2))[0])
+    direction = random_like(state.keep, jax.random.key(3))
+    gradient = jax.jit(jax.grad(loss))(state.keep)
+    assert along(gradient, direction) == pytest.approx(slope(loss, state.keep, direction, by=3e-3), rel=0.03)
+
+
+def test_names_find_their_agents_and_agents_their_names():
+    for name in agents.names():
+        agent = agents.make(name, gamma=0.5)
+        assert agents.name_of(agent) == name
+        assert agents.make(name, **dataclasses.asdict(agent)) == agent
+    assert agents.name_of(agents.make("vrm", models="single")) == "vrm-single"
+
+
+def test_unknown_models_are_refused():
+    with pytest.raises((UserError, TypeError), match="models"):
+        agents.make("vrm", models="three")

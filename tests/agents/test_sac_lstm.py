@@ -1,0 +1,154 @@
+"""SAC-LSTM: its LSTM against numpy, where gradients go, beliefs in time."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from agents.moments import SPEC, along, changed_where_missing, differ, random_like, slope, windows
+from beliefrl.agents.sac_lstm import SACLSTMAgent
+from beliefrl.nets import LSTM, LSTMState, _lstm_loop, _lstm_scan, draw
+from beliefrl.soft_actor_critic import actor_loss, q_loss, state_value, value_loss
+from beliefrl.types import UserError, time_major
+
+AGENT = SACLSTMAgent(policy_layers=(8,), value_layers=(8,), d_size=8, seq_len=6, batch_size=2, burn_in=4)
+TIME = 11
+
+
+@pytest.fixture(scope="module")
+def state():
+    return jax.jit(lambda key: AGENT.init(key, SPEC))(jax.random.key(0))
+
+
+def sigmoid(x):
+    return 1 / (1 + np.exp(-x))
+
+
+def test_the_lstm_is_the_textbooks():
+    lstm = draw(jax.random.key(0), LSTM(3, 4))
+    x = np.asarray(jax.random.normal(jax.random.key(1), (5, 2, 3)))
+    is_first = np.zeros((5, 2), bool)
+    is_first[3, 1] = True
+    ours = jax.jit(lambda: lstm.unroll(lstm.start(2), jnp.asarray(x), jnp.asarray(is_first)))()
+    d, c = np.zeros((2, 4)), np.zeros((2, 4))
+    for t in range(5):
+        d, c = (np.where(is_first[t][:, None], 0.0, part) for part in (d, c))
+        i, f, g, o = np.split(x[t] @ np.asarray(lstm.by_x) + d @ np.asarray(lstm.by_d) + np.asarray(lstm.bias), 4, -1)
+        c = sigmoid(f) * c + sigmoid(i) * np.tanh(g)
+        d = sigmoid(o) * np.tanh(c)
+        np.testing.assert_allclose(ours.d[t], d, rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(ours.c[t], c, rtol=1e-4, atol=1e-6)
+
+
+def test_the_loops_gradient_is_that_of_plain_differentiation():
+    lstm = draw(jax.random.key(0), LSTM(3, 4))
+    start = LSTMState(*jax.random.normal(jax.random.key(1), (2, 3, 4)))
+    given = jax.random.normal(jax.random.key(2), (5, 3, 16))
+    is_first = jnp.zeros((5, 3), bool).at[2, 1].set(True)
+
+    def probe(function, *args):
+        leaves = jax.tree.leaves(function(*args, is_first))
+        return sum(jnp.sum(leaf * jax.random.normal(jax.random.key(i), leaf.shape)) for i, leaf in enumerate(leaves))
+
+    gradients = [
+        jax.jit(jax.grad(lambda *args, f=f: probe(f, *args), (0, 1, 2)))(lstm.by_d, start, given)
+        for f in (_lstm_loop, _lstm_scan)
+    ]
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), *gradients)
+
+
+def test_acting_forms_the_belief_that_replay_forms(state):
+    window = windows(jax.random.key(1), 1, TIME, jnp.zeros((1, TIME), bool).at[0, jnp.array([0, 5])].set(True))
+    step = time_major(window, 0, None).step
+    at_once = jax.jit(lambda: state.lstm.unroll(state.lstm.start(1), AGENT.perception(step), step.is_first))()
+    memory, act = AGENT.reset(SPEC), jax.jit(AGENT.act)
+    for t in range(TIME):
+        moment = jax.tree.map(lambda leaf, t=t: leaf[0, t], window.step)
+        _, memory = act(state, memory, moment, jax.random.key(t), jnp.array(False))
+        np.testing.assert_allclose(memory.d, at_once.d[t, 0], rtol=1e-5, atol=1e-6)
+
+
+def test_batches_are_aligned_in_time(state):
+    window = windows(jax.random.key(1), 2, TIME)
+    batch = jax.jit(AGENT.batch)(state.lstm, window)
+    step = time_major(window, 0, None).step
+    d = jax.jit(lambda: state.lstm.unroll(state.lstm.start(2), AGENT.perception(step), step.is_first).d)()
+    for t, sequence in ((0, 0), (2, 1), (5, 1)):
+        row, now = 2 * t + sequence, AGENT.burn_in + t
+        np.testing.assert_allclose(batch.belief[row], d[now, sequence], rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(batch.next_belief[row], d[now + 1, sequence], rtol=1e-5, atol=1e-6)
+        np.testing.assert_array_equal(batch.action[row], step.prev_action[now + 1, sequence])
+        assert batch.reward[row] == step.reward[now + 1, sequence]
+
+
+def frozen_losses(agent, state, window, key):
+    """J_π, J_V and J_Q as functions of the LSTM, in which all that they are not to train keeps its value."""
+    fixed, controller = agent.batch(state.lstm, window), state.controller
+    noise = jax.random.normal(key, fixed.action.shape)
+    q, log_prob = actor_loss(controller.actor, controller, fixed, noise, 1e-3)[1]
+    v_target = q - jnp.exp(controller.log_alpha) * log_prob
+    beyond = jnp.where(fixed.terminated, 0.0, state_value(controller.target_value, fixed.next_belief))
+    ends = fixed._replace(reward=fixed.reward + agent.gamma * beyond, terminated=jnp.ones_like(fixed.terminated))
+
+    def j_pi(lstm):
+        seen = agent.batch(lstm, window).belief
+        return actor_loss(controller.actor, controller, fixed._replace(seen=seen), noise, 1e-3)[0]
+
+    def j_v(lstm):
+        return value_loss(controller.value, agent.batch(lstm, window).belief, v_target, fixed.valid)
+
+    def j_q(lstm):
+        belief = agent.batch(lstm, window).belief
+        return q_loss(controller.critics, controller.target_value, ends._replace(belief=belief), agent.gamma)
+
+    return j_pi, j_v, j_q
+
+
+def test_gradients_of_three_losses_reach_the_lstm_and_none_through_targets(state):
+    """By finite differences of each loss alone; together they are the gradient that the agent uses."""
+    agent = dataclasses.replace(AGENT, burn_in=0, seq_len=TIME - 1)
+    window, key = windows(jax.random.key(1), 2, TIME), jax.random.key(2)
+    direction = random_like(state.lstm, jax.random.key(3))
+    functions = [jax.jit(function) for function in frozen_losses(agent, state, window, key)]
+    slopes = [slope(function, state.lstm, direction) for function in functions]
+    gradient = jax.jit(jax.grad(agent.loss, has_aux=True))(state.lstm, state.controller, window, key)[0]
+    assert all(abs(each) > 1e-3 for each in slopes)
+    assert along(gradient, direction) == pytest.approx(sum(slopes), rel=0.02)
+
+
+def test_no_gradient_goes_into_the_burn_in(state):
+    """The weights by which the burn-in alone perceives the first input do not learn."""
+    window, key = windows(jax.random.key(1), 2, TIME), jax.random.key(2)
+    obs = window.step.obs.at[:, AGENT.burn_in :, 0].set(0.0)
+    window = window._replace(step=window.step._replace(obs=obs))
+    by_lstm = jax.jit(jax.grad(AGENT.loss, has_aux=True))(state.lstm, state.controller, window, key)[0]
+    np.testing.assert_array_equal(by_lstm.by_x[0], 0.0)
+    assert np.all(by_lstm.by_x[1] != 0.0)
+
+
+def test_an_update_trains_everything_but_the_target(state):
+    window = windows(jax.random.key(1), 2, TIME)
+    after, _ = jax.jit(AGENT.pretrain)(state, window, jax.random.key(2))
+    assert differ(after.lstm, state.lstm)
+    assert differ(after.controller._replace(target_value=0), state.controller._replace(target_value=1))
+
+
+def test_moments_that_do_not_exist_enter_no_loss(state):
+    exists = jnp.ones((2, TIME), bool).at[:, 8:].set(False)
+    results = changed_where_missing(AGENT, state, windows(jax.random.key(1), 2, TIME), exists)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), *results)
+
+
+def test_it_perceives_what_it_is_told_to():
+    for more, size in (({}, 3), ({"perceive_action": True}, 5), ({"perceive_reward": True}, 4)):
+        agent = dataclasses.replace(AGENT, **more)
+        state = jax.eval_shape(lambda key, agent=agent: agent.init(key, SPEC), jax.random.key(0))
+        assert state.lstm.by_x.shape[0] == size
+
+
+@pytest.mark.parametrize("wrong", [{"seq_len": 0}, {"burn_in": -1}, {"lr_lstm": 2.0}, {"pretrain_updates": -1}])
+def test_impossible_hyperparameters_are_refused(wrong):
+    with pytest.raises(UserError, match=f"{next(iter(wrong))}="):
+        SACLSTMAgent(**wrong)
