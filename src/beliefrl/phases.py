@@ -2,7 +2,7 @@
 
     explore    step_start_rl environment steps with the untrained policy
     pretrain   updates on what they recorded; then the actor and the replay perceive it again
-    learn      cycles: the agent prepares one (VRM: updates its model), then acts, records and updates at every step
+    learn      cycles: act and record for the steps of one; then draw from the replay for it, and make its updates
 
 The step counter stays outside what is mapped over seeds, and each phase is a compiled function of its own, called
 for a stretch of steps whose number is an argument: one compilation serves all stretches, and no result depends on
@@ -135,30 +135,29 @@ def learn(agent: Agent, task: Task, seed: Seed, first: Int[Array, ""], cycles: I
 def _cycle(
     agent: Agent, task: Task, seed: Seed, log: Episode, first: Int[Array, ""], index: Int[Array, ""]
 ) -> tuple[Seed, Episode, Metrics]:
-    """One cycle, from environment step `first` on, whose entries in the log begin at `index`."""
-    windows = ring.sample(seed.replay, _step_key(seed, first, SAMPLE), agent.cycle_windows, agent.window)
-    # The windows are read before the cycle's moments are added: without the barrier XLA copies the whole ring.
-    windows, replay = jax.lax.optimization_barrier((windows, seed.replay))
-    state, batches, model_metrics = agent.begin_cycle(seed.state, windows, _step_key(seed, first, CYCLE))
-    seed = seed._replace(state=state, replay=replay)
-    interval = agent.train_interval_rl
+    """One cycle, from environment step `first` on, whose entries in the log begin at `index`.
 
-    def act(carry, offset):
+    Its moments are added before any are drawn, and in a loop whose length XLA does not know (it would inline one of a
+    single step): in either other form XLA copies the whole ring.
+    """
+
+    def act(step, carry):
         seed, log = carry
-        key = _step_key(seed, first + offset, ACT)
+        key = _step_key(seed, step, ACT)
         actor, replay, episode = rollout.advance(agent, task, seed.state, seed.actor, seed.replay, key)
-        return (seed._replace(actor=actor, replay=replay), _write(log, index + offset, episode)), None
+        return seed._replace(actor=actor, replay=replay), _write(log, index + step - first, episode)
 
-    def update(carry, inputs):
+    seed, log = jax.lax.fori_loop(first, first + agent.cycle, act, (seed, log))
+    windows = ring.sample(seed.replay, _step_key(seed, first, SAMPLE), agent.cycle_windows, agent.window)
+    state, batches, model_metrics = agent.begin_cycle(seed.state, windows, _step_key(seed, first, CYCLE))
+
+    def update(state, inputs):
         number, batch = inputs
-        carry, _ = jax.lax.scan(act, carry, number * interval + jnp.arange(interval))
-        seed, log = carry
-        state, metrics = agent.update(seed.state, batch, _step_key(seed, first + number, UPDATE))
-        return (seed._replace(state=state), log), metrics
+        return agent.update(state, batch, _step_key(seed, first + number, UPDATE))
 
-    updates = jnp.arange(agent.cycle // interval)
-    (seed, log), metrics = jax.lax.scan(update, (seed, log), (updates, batches))
-    return seed, log, model_metrics | jax.tree.map(jnp.mean, metrics)
+    updates = jnp.arange(agent.cycle // agent.train_interval_rl)
+    state, metrics = jax.lax.scan(update, state, (updates, batches))
+    return seed._replace(state=state), log, model_metrics | jax.tree.map(jnp.mean, metrics)
 
 
 def evaluate(agent: Agent, task: Task, state: Any, key: Key[Array, ""], episodes: int) -> Episode:

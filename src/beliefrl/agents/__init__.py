@@ -20,7 +20,8 @@ class Agent(Protocol):
     """A frozen dataclass of hyperparameters whose methods are pure functions.
 
     A training explores for `step_start_rl` steps with the untrained policy, calls `pretrain` `pretrain_updates` times,
-    and then goes in cycles of `cycle` steps: `begin_cycle` once, `update` after every `train_interval_rl` steps.
+    and then goes in cycles of `cycle` steps: when these are done, `begin_cycle` once, then an `update` for every
+    `train_interval_rl` of them.
     """
 
     @property

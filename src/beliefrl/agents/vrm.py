@@ -8,9 +8,8 @@ and sends no gradient back. In an ablation the belief has the d_t of one model, 
 Departures:
 1. The first-impression d_t is computed once, when it is perceived, and kept in the replay (`store_first_impression`):
    the model does not change any more, so only the sample of z is not drawn anew.
-2. A cycle of `train_interval_klvrm` steps draws its windows at its beginning: between two of its updates the
-   keep-learning model stands still, so one unroll gives the beliefs of all controller updates in between, and the
-   up to four newest moments wait for the next cycle.
+2. A cycle of `train_interval_klvrm` steps makes its updates at its end: one of the keep-learning model, then those of
+   the controller. In between the model stands still, so one unroll gives the beliefs for all of them.
 3. A mode action is also a mode of the belief: z is the posterior's mean where the agent does not explore.
 """
 

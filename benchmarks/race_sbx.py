@@ -1,0 +1,84 @@
+"""SAC-MLP raced against SBX's SAC: updates per second of both on Pendulum, in turn, on this machine.
+
+The same sizes (two hidden layers of 256, batches of 256, one update a step, Adam at 3e-4); what each calls SAC differs:
+ours has V and its target and separate networks for μ and log σ, SBX has two target Qs and one network for both. Ours
+steps a Pendulum in JAX inside the compiled program, SBX Gymnasium's in Python; both times include stepping.
+
+    python -m venv /tmp/sbx && /tmp/sbx/bin/pip install torch==2.13.0 "sbx-rl==0.28.*"
+    python benchmarks/race_sbx.py /tmp/sbx/bin/python
+"""
+
+import json
+import statistics
+import subprocess
+import sys
+import time
+
+ROUNDS, WARM, STEPS = 5, 1_500, 3_000
+
+
+def ours() -> float:
+    """Updates per second of beliefrl's sac-mlp."""
+    import jax
+
+    from beliefrl import agents, phases, tasks
+
+    agent, task = agents.make("sac-mlp", step_start_rl=1_000), tasks.make("pendulum")
+    program = phases.compile_program(agent, task, capacity=1_000_000, episodes=1)
+    seeds, step = program.begin(jax.random.split(jax.random.key(0), 1)), 0
+    stretch = phases.stretch_length(agent)
+    while step < agent.step_start_rl:
+        seeds, _ = program.explore(seeds, step, stretch)
+        step += stretch
+    while step < WARM:
+        seeds, _ = program.learn(seeds, step, stretch)
+        step += stretch
+    jax.block_until_ready(seeds)
+    began = time.perf_counter()
+    for _ in range(STEPS // stretch):
+        seeds, _ = program.learn(seeds, step, stretch)
+        step += stretch
+    jax.block_until_ready(seeds)
+    return STEPS / (time.perf_counter() - began)
+
+
+def theirs() -> float:
+    """Updates per second of SBX's SAC."""
+    import jax
+    from sbx import SAC
+
+    settings = {"batch_size": 256, "learning_rate": 3e-4, "learning_starts": 1_000, "buffer_size": 1_000_000}
+    model = SAC("MlpPolicy", "Pendulum-v1", train_freq=1, gradient_steps=1, seed=0, **settings)
+    model.learn(WARM)
+    jax.block_until_ready(model.policy.actor_state.params)
+    before, began = model._n_updates, time.perf_counter()
+    model.learn(STEPS, reset_num_timesteps=False)
+    jax.block_until_ready(model.policy.actor_state.params)
+    return (model._n_updates - before) / (time.perf_counter() - began)
+
+
+def main(peer: str) -> None:
+    """Race `ROUNDS` times in turn, each in a process of its own, and print medians."""
+    rates = {"ours": [], "theirs": []}
+    for number in range(ROUNDS):
+        for who, python in (("ours", sys.executable), ("theirs", peer)):
+            told = subprocess.run([python, __file__, "--run", who], capture_output=True, text=True, check=True).stdout
+            rates[who].append(float(told.split()[-1]))
+        print(
+            f"round {number + 1}: beliefrl {rates['ours'][-1]:.0f}, SBX {rates['theirs'][-1]:.0f} updates/s", flush=True
+        )
+    medians = {who: statistics.median(values) for who, values in rates.items()}
+    print(
+        json.dumps(
+            {"beliefrl": medians["ours"], "sbx": medians["theirs"], "ratio": medians["ours"] / medians["theirs"]}
+        )
+    )
+
+
+if __name__ == "__main__":
+    if len(sys.argv) == 3 and sys.argv[1] == "--run":
+        print({"ours": ours, "theirs": theirs}[sys.argv[2]]())
+    elif len(sys.argv) == 2:
+        main(sys.argv[1])
+    else:
+        raise SystemExit(__doc__)
