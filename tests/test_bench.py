@@ -8,7 +8,7 @@ import sys
 import jax
 import pytest
 
-from beliefrl import agents
+from beliefrl import agents, cli
 from beliefrl.bench import Noise, bench, parameters
 from beliefrl.types import Spec, UserError
 
@@ -51,6 +51,37 @@ def test_bench_prints_one_object_of_positive_numbers(monkeypatch):
         "vrm", d_size=4, z_size=2, hidden_size=4, policy_layers=(4,), value_layers=(4,), seq_len=4, burn_in=2
     )
     assert result["parameters"] == parameters(shapes(agent, Spec(obs_dim=2, action_dim=1, max_steps=1000)))
+
+
+def test_bench_all_prints_the_scalability_table(monkeypatch, capsys):
+    """Every agent at the sizes asked for; measuring is left to the other tests."""
+
+    def measured(agent, *sizes):
+        assert sizes == (4, 2, 3)
+        return {"ms_per_step": 12.5, "parameters": parameters(shapes(agent, Spec(4, 2, 10))), "share_of_peak": 0.5}
+
+    monkeypatch.setattr("beliefrl.bench.bench", measured)
+    monkeypatch.setenv("COLUMNS", "120")
+    cli.main(["bench", "all", "--obs", "4", "--actions", "2", "--seeds", "3"])
+    lines = capsys.readouterr().out.splitlines()
+    for name in agents.names():
+        assert any(name in line and "12.5" in line and "20:50" in line and "50%" in line for line in lines)
+    cli.main(["bench", "all", "--obs", "4", "--actions", "2", "--seeds", "3", "--json"])
+    assert set(json.loads(capsys.readouterr().out)) == set(agents.names())
+
+
+def test_bench_measures_an_agent_without_a_model():
+    """Its begin_cycle only prepares the batch, so no time counts as a model's."""
+    agent = agents.make("sac-mlp", step_start_rl=10, batch_size=4, policy_layers=(4,), value_layers=(4,))
+    result = bench(agent, 2, 1)
+    assert result["model_update_ms"] == 0
+    assert result["controller_update_ms"] > 0
+
+
+@pytest.mark.parametrize(("name", "millions"), [("sac-mlp", 0.4), ("sac-lstm", 1.1), ("slac", 1.6)])
+def test_parameters_are_those_of_the_papers_table(name, millions):
+    """Of SLAC's 2.8 million there, 1.2 are the networks for σ and for first moments that ours does without."""
+    assert parameters(shapes(agents.make(name), Spec(6, 3, 1000))) == pytest.approx(1e6 * millions, abs=5e4)
 
 
 def test_parameters_are_the_authors_without_what_they_do_not_use():
