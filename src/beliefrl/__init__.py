@@ -14,6 +14,7 @@ from beliefrl.agents import Agent
 from beliefrl.agents import make as make_agent
 from beliefrl.analysis.curves import draw_curve
 from beliefrl.evaluation import evaluate
+from beliefrl.policy import Policy, load
 from beliefrl.runs import Run
 from beliefrl.tasks import Task, observe
 from beliefrl.tasks import make as make_task
@@ -27,6 +28,7 @@ __all__ = [
     "Event",
     "Moment",
     "Options",
+    "Policy",
     "Run",
     "Spec",
     "Step",
@@ -36,6 +38,7 @@ __all__ = [
     "WindowShape",
     "draw_curve",
     "evaluate",
+    "load",
     "make_agent",
     "make_task",
     "observe",

@@ -21,6 +21,7 @@ Reinforcement learning for agents that do not see the whole state.
 
   beliefrl train AGENT TASK     train, with a live view, into a run's folder
   beliefrl evaluate RUN         play new episodes with what a run has learned
+  beliefrl export RUN FILE      write the learned policy as one file that jax loads without this library
   beliefrl tasks                list the tasks
   beliefrl agents               list the agents
   beliefrl bench AGENT          time a training step on this machine, part by part; `all` compares the agents
@@ -52,6 +53,18 @@ class EvaluateOptions:
     """Of these episodes: the same seed gives the same numbers."""
     json: bool = False
     """Print one JSON object: per mode the mean, S.E.M., every seed's mean, and success."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportOptions:
+    """Write what a run has learned as one file that jax loads without this library (`beliefrl.Policy.export`)."""
+
+    run: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="RUN")]
+    """The run's folder."""
+    file: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="FILE")]
+    """The file to write; one that is there is replaced."""
+    seed: int | None = None
+    """Which of the run's seeds; None is its first."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,6 +131,15 @@ def evaluate(argv: Sequence[str]) -> None:
     Console().print(results_table(results, run.seeds, title))
 
 
+def export(argv: Sequence[str]) -> None:
+    """`beliefrl export RUN FILE ...`."""
+    options = parse(ExportOptions, argv, "beliefrl export")
+    from beliefrl.policy import load
+
+    load(options.run, options.seed).export(options.file)
+    print(f"written to {options.file}: jax.export.deserialize reads it")
+
+
 def list_tasks(argv: Sequence[str]) -> None:
     """`beliefrl tasks`."""
     parse(ListOptions, argv, "beliefrl tasks")
@@ -173,6 +195,7 @@ def bench(argv: Sequence[str]) -> None:
 COMMANDS: dict[str, Callable[[Sequence[str]], None]] = {
     "train": train,
     "evaluate": evaluate,
+    "export": export,
     "tasks": list_tasks,
     "agents": list_agents,
     "bench": bench,

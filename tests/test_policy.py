@@ -1,0 +1,131 @@
+"""A trained policy: the agent's own actions, in numpy; and its export, which jax alone can load."""
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import beliefrl
+from beliefrl import agents, rollout, tasks
+from beliefrl.policy import Policy
+from beliefrl.types import UserError
+
+SMALL = {
+    "vrm": {"d_size": 8, "z_size": 4, "hidden_size": 8},
+    "sac-mlp": {},
+    "sac-lstm": {"d_size": 8},
+    "slac": {"z1_size": 2, "z2_size": 4, "model_layers": (8,), "history": 3},
+}
+TASK = tasks.make("pendulum-p", max_steps=4)
+
+
+def trained(name):
+    """A small agent and a state of it."""
+    agent = agents.make(name, policy_layers=(8,), value_layers=(8,), **SMALL[name])
+    return agent, jax.jit(lambda key: agent.init(key, TASK.spec))(jax.random.key(0))
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_it_acts_as_the_agent_does_through_episodes(name):
+    """Two episodes in one batch, of which one begins anew while the other goes on: mode actions, moment by moment."""
+    agent, state = trained(name)
+    policy = Policy(agent, TASK.spec, state)
+    move = jax.jit(lambda actor: rollout.move(agent, TASK, state, actor, jax.random.key(1), jnp.array(False)))
+    actors = [rollout.begin(agent, TASK, jax.random.key(k)) for k in (1, 2)]
+    memory = None
+    for t in range(5):
+        if t == 3:
+            actors[1] = rollout.begin(agent, TASK, jax.random.key(3))
+        steps = [actor.step for actor in actors]
+        parts = ("obs", "reward", "is_first")
+        obs, reward, first = (np.stack([getattr(step, part) for step in steps]) for part in parts)
+        # of no account where an episode begins
+        action, memory = policy.predict(obs, np.where(first, 7.0, reward), memory, first)
+        actors = [move(actor)[0] for actor in actors]
+        np.testing.assert_allclose(action, np.stack([actor.step.prev_action for actor in actors]), rtol=1e-5, atol=1e-6)
+
+
+def test_one_episode_is_a_batch_of_one():
+    policy = Policy(*_with_spec("vrm"))
+    alone, state = policy.predict([0.1, 0.2])
+    together, _ = policy.predict([[0.1, 0.2]])
+    assert alone.shape == (1,)
+    np.testing.assert_array_equal(alone, together[0])
+    again, _ = policy.predict([0.3, 0.1], -1.0, state)
+    fresh, _ = policy.predict([0.3, 0.1], -1.0)
+    assert not np.allclose(again, fresh)
+
+
+def _with_spec(name):
+    agent, state = trained(name)
+    return agent, TASK.spec, state
+
+
+def test_samples_differ_and_come_back_with_their_seed():
+    drawn = {}
+    for seed in (1, 1, 2):
+        policy = Policy(*_with_spec("sac-mlp"), seed)
+        actions = np.stack([policy.predict(np.zeros((3, 2)), deterministic=False)[0] for _ in range(2)])
+        assert len(np.unique(actions)) == 6
+        np.testing.assert_array_equal(drawn.setdefault(seed, actions), actions)
+    assert not np.array_equal(drawn[1], drawn[2])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        ({"obs": np.zeros(3)}, r"obs has the shape \(3,\): it must be \(2,\) or \(batch, 2\)"),
+        ({"obs": np.zeros((2, 2)), "reward": np.zeros(3)}, r"reward has the shape \(3,\)"),
+        ({"obs": np.zeros((2, 2)), "episode_start": [True]}, r"episode_start has the shape \(1,\)"),
+        ({"obs": np.zeros((2, 2)), "state": (np.zeros((1, 1)),)}, "state does not fit 2 episodes"),
+    ],
+)
+def test_wrong_shapes_are_one_sentence(wrong, sentence):
+    with pytest.raises(UserError, match=sentence):
+        Policy(*_with_spec("sac-mlp")).predict(**wrong)
+
+
+def test_an_export_that_cannot_be_written_is_one_sentence(tmp_path):
+    with pytest.raises(UserError, match=r"policy.jax cannot be written \(No such file or directory\)"):
+        Policy(*_with_spec("sac-mlp")).export(tmp_path / "missing" / "policy.jax")
+
+
+ALONE = """
+import pathlib, sys
+import jax, jax.export, numpy as np
+policy = jax.export.deserialize(pathlib.Path(sys.argv[1]).read_bytes())
+(obs, reward, *state, start, seed, mode) = policy.in_avals
+state = tuple(np.zeros((2, *part.shape[1:]), part.dtype) for part in state)
+for first in (True, False):
+    inputs = np.full((2, 2), 0.3, np.float32), np.full(2, -1.0, np.float32), state, np.full(2, first)
+    action, state = policy.call(*inputs, np.uint32(0), np.bool_(True))
+    print(*np.asarray(action).ravel())
+assert "beliefrl" not in sys.modules
+"""
+
+
+@pytest.mark.parametrize("name", ["vrm", "slac"])
+def test_the_export_acts_the_same_with_jax_alone(name, tmp_path):
+    policy = Policy(*_with_spec(name))
+    policy.export(tmp_path / "policy.jax")
+    command = [sys.executable, "-c", ALONE, tmp_path / "policy.jax"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    obs, state = np.full((2, 2), 0.3), None
+    for line in done.stdout.splitlines():
+        action, state = policy.predict(obs, -1.0, state)
+        np.testing.assert_allclose(np.array(line.split(), float), action.ravel(), rtol=1e-5, atol=1e-6)
+
+
+def test_a_runs_policy_is_loaded_by_its_seed(tmp_path):
+    options = {"steps": 12, "seeds": 2, "seed": 4, "eval_every": 12, "eval_episodes": 1}
+    agent = agents.make("sac-mlp", policy_layers=(8,), value_layers=(8,), step_start_rl=10, pretrain_updates=0)
+    run = beliefrl.train(agent, TASK, tmp_path / "run", **options)
+    first, second = (beliefrl.load(run, seed).predict([0.1, 0.2])[0] for seed in (4, 5))
+    assert first != second
+    np.testing.assert_array_equal(beliefrl.load(tmp_path / "run").predict([0.1, 0.2])[0], first)
+    with pytest.raises(UserError, match="has no seed 6: it has 4, 5"):
+        beliefrl.load(run, 6)
