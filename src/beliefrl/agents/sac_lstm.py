@@ -6,7 +6,7 @@ through the targets and through the Q of the actor's loss do not.
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Key
 from beliefrl.agents.sac import SAC, Metrics, split_updates
 from beliefrl.nets import LSTM, LSTMState, descend, draw, tanh_gaussian
 from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState, update
-from beliefrl.types import Spec, Step, Window, WindowShape, check_range, time_major, transitions
+from beliefrl.types import Spec, Step, Window, WindowShape, check_choice, check_range, time_major, transitions
 
 
 class State(NamedTuple):
@@ -44,6 +44,8 @@ class SACLSTMAgent(SAC):
     """Adam's learning rate for the LSTM (the authors' code)."""
     pretrain_updates: int = 5000
     """Updates of the whole at step_start_rl, as many as VRM's pre-training has (Section 5; 0 is off)."""
+    lstm_learns_from: Literal["all", "critics"] = "all"
+    """Losses whose gradients reach the LSTM: all (Appendix A.2.2), or those of Q and V without the actor's."""
     perceive_action: bool = False
     """Let the LSTM perceive the previous action beside the observation (the paper's does not)."""
     perceive_reward: bool = False
@@ -55,6 +57,7 @@ class SACLSTMAgent(SAC):
         check_range(self, ("seq_len", "batch_size", "d_size"), 1)
         check_range(self, ("burn_in", "pretrain_updates"), 0)
         check_range(self, ("lr_lstm",), 0, 1)
+        check_choice(self, "lstm_learns_from", ("all", "critics"))
 
     # How it is trained
 
@@ -139,6 +142,7 @@ class SACLSTMAgent(SAC):
             reward=step.reward[1:],
             terminated=step.terminated[1:],
             valid=transitions(windows, self.burn_in).T,
+            seen=None if self.lstm_learns_from == "all" else jax.lax.stop_gradient(d[:-1]),
         )
         return jax.tree.map(lambda leaf: leaf[0], split_updates(batch, self.batch_size))
 
