@@ -118,6 +118,21 @@ def test_gradients_of_three_losses_reach_the_lstm_and_none_through_targets(state
     assert along(gradient, direction) == pytest.approx(sum(slopes), rel=0.02)
 
 
+def test_the_lstm_can_learn_from_the_critics_alone(state):
+    """Without the actor's, its gradient is that of J_V and J_Q; the actor's own does not change."""
+    window, key = windows(jax.random.key(1), 2, TIME), jax.random.key(2)
+    critics = dataclasses.replace(AGENT, lstm_learns_from="critics")
+    (all_lstm, all_controller), (lstm, controller) = (
+        jax.jit(jax.grad(agent.loss, (0, 1), has_aux=True))(state.lstm, state.controller, window, key)[0]
+        for agent in (AGENT, critics)
+    )
+    _, j_v, j_q = frozen_losses(AGENT, state, window, key)
+    expected = jax.jit(jax.grad(lambda lstm: j_v(lstm) + j_q(lstm)))(state.lstm)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), lstm, expected)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), controller, all_controller)
+    assert differ(lstm, all_lstm)
+
+
 def test_no_gradient_goes_into_the_burn_in(state):
     """The weights by which the burn-in alone perceives the first input do not learn."""
     window, key = windows(jax.random.key(1), 2, TIME), jax.random.key(2)
