@@ -1,4 +1,8 @@
-"""Agents learn tasks, from the command to the last evaluation, with their default settings. Minutes each."""
+"""Agents learn tasks, from the command to the last evaluation, with their default settings: minutes each.
+
+VRM takes five minutes to its first solved task; what it reaches is in docs/results, and `test_probes` has it learn
+small worlds that need memory.
+"""
 
 import json
 import os
@@ -9,7 +13,6 @@ import pytest
 
 LEARNED = {  # agent, task, steps, a return that says the task was learned
     "sac-mlp": ("pendulum", 4_000, -300),
-    "vrm": ("pendulum-p", 8_000, -400),
 }
 
 

@@ -1,7 +1,7 @@
 """SLAC's latent variable model: two latent variables a moment, z¹ inferred from what is perceived, z² a memory of it.
 
 Source: Lee et al. 2019, Section 4; sizes and activations: Han, Doya, Tani 2020, Appendix A.2.3. With
-x_t = (o_t, r_{t-1}), z_t = [z¹_t, z²_t], and `before` meaning z²_{t-1}, a_{t-1}:
+x_t = (o_t, r_{t-1}) and z_t = [z¹_t, z²_t]:
 
     posterior  q(z¹_t) = N(μ, σ)[x_t, z²_{t-1}, a_{t-1}]
     prior      p(z¹_t) = N(μ, σ)[z²_{t-1}, a_{t-1}], and N(0, 1) at an episode's first moment
