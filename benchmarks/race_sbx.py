@@ -14,7 +14,7 @@ import subprocess
 import sys
 import time
 
-ROUNDS, WARM, STEPS = 5, 1_500, 3_000
+ROUNDS, WARM, STEPS = 3, 1_500, 3_000
 
 
 def ours() -> float:

@@ -107,7 +107,7 @@ assert "beliefrl" not in sys.modules
 """
 
 
-@pytest.mark.parametrize("name", ["vrm", "slac"])
+@pytest.mark.parametrize("name", ["vrm", pytest.param("slac", marks=pytest.mark.slow)])
 def test_the_export_acts_the_same_with_jax_alone(name, tmp_path):
     policy = Policy(*_with_spec(name))
     policy.export(tmp_path / "policy.jax")

@@ -71,7 +71,7 @@ def matmul_gflops(size: int = 2048) -> float:
 
 def parameters(tree: Any) -> int:
     """How many numbers the networks in an agent's state hold, optimisers apart."""
-    networks = [value for name, value in tree._asdict().items() if not name.endswith("optimiser")]
+    networks = [value for name, value in tree._asdict().items() if "optimiser" not in name]
     return sum(leaf.size for leaf in jax.tree.leaves(networks))
 
 

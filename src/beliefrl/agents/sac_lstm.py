@@ -6,7 +6,7 @@ through the targets and through the Q of the actor's loss do not.
 """
 
 import dataclasses
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Key
 from beliefrl.agents.sac import SAC, Metrics, split_updates
 from beliefrl.nets import LSTM, LSTMState, descend, draw, tanh_gaussian
 from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState, update
-from beliefrl.types import Spec, Step, Window, WindowShape, check_choice, check_range, time_major, transitions
+from beliefrl.types import Spec, Step, Window, WindowShape, check_range, time_major, transitions
 
 
 class State(NamedTuple):
@@ -24,7 +24,7 @@ class State(NamedTuple):
 
     lstm: LSTM
     controller: Controller
-    lstm_optimiser: optax.OptState
+    lstm_optimisers: tuple[optax.OptState, optax.OptState]  # for the critics' gradient and for the actor's
     controller_optimiser: OptimiserState
 
 
@@ -41,11 +41,9 @@ class SACLSTMAgent(SAC):
     d_size: int = 256
     """Size of the LSTM's state (Appendix A.2.2)."""
     lr_lstm: float = 3e-4
-    """Adam's learning rate for the LSTM (the authors' code)."""
+    """Adam's learning rate for the LSTM, which learns from the critics and from the actor in turn (authors' code)."""
     pretrain_updates: int = 5000
     """Updates of the whole at step_start_rl, as many as VRM's pre-training has (Section 5; 0 is off)."""
-    lstm_learns_from: Literal["all", "critics"] = "all"
-    """Losses whose gradients reach the LSTM: all (Appendix A.2.2), or those of Q and V without the actor's."""
     perceive_action: bool = False
     """Let the LSTM perceive the previous action beside the observation (the paper's does not)."""
     perceive_reward: bool = False
@@ -57,7 +55,6 @@ class SACLSTMAgent(SAC):
         check_range(self, ("seq_len", "batch_size", "d_size"), 1)
         check_range(self, ("burn_in", "pretrain_updates"), 0)
         check_range(self, ("lr_lstm",), 0, 1)
-        check_choice(self, "lstm_learns_from", ("all", "critics"))
 
     # How it is trained
 
@@ -87,7 +84,7 @@ class SACLSTMAgent(SAC):
         lstm = draw(key_lstm, LSTM(x, self.d_size))
         controller, controller_optimiser = self.init_controller(key_controller, self.d_size, spec.action_dim)
         lstm_optimiser = self.lstm_optimiser.init(lstm)  # pyright: ignore[reportArgumentType]
-        return State(lstm, controller, lstm_optimiser, controller_optimiser)
+        return State(lstm, controller, (lstm_optimiser, lstm_optimiser), controller_optimiser)
 
     # Acting
 
@@ -125,16 +122,19 @@ class SACLSTMAgent(SAC):
         """A cycle has one update: its windows."""
         return state, jax.tree.map(lambda leaf: leaf[None], windows), {}
 
-    def batch(self, lstm: LSTM, windows: Window) -> Batch:
-        """The windows' transitions with their beliefs; no gradient goes into the burn-in nor into targets."""
+    def beliefs(self, lstm: LSTM, windows: Window) -> Float[Array, "time batch d"]:
+        """d_t from the end of the burn-in on; no gradient goes into the burn-in."""
         before, after = time_major(windows, 0, self.burn_in), time_major(windows, self.burn_in, None)
         start = lstm.start(self.batch_size)
         if self.burn_in:
             still = jax.lax.stop_gradient(lstm)
             burnt_in = still.unroll(start, self.perception(before.step), before.step.is_first)
             start = jax.tree.map(lambda leaf: leaf[-1], burnt_in)
-        step = after.step
-        d = lstm.unroll(start, self.perception(step), step.is_first).d
+        return lstm.unroll(start, self.perception(after.step), after.step.is_first).d
+
+    def batch(self, windows: Window, d: Float[Array, "time batch d"], d_actor: Float[Array, "time batch d"]) -> Batch:
+        """The windows' transitions, with beliefs for the critics and for the actor (the same numbers)."""
+        step = time_major(windows, self.burn_in, None).step
         batch = Batch(
             belief=d[:-1],
             next_belief=d[1:],
@@ -142,22 +142,29 @@ class SACLSTMAgent(SAC):
             reward=step.reward[1:],
             terminated=step.terminated[1:],
             valid=transitions(windows, self.burn_in).T,
-            seen=None if self.lstm_learns_from == "all" else jax.lax.stop_gradient(d[:-1]),
+            seen=d_actor[:-1],
         )
         return jax.tree.map(lambda leaf: leaf[0], split_updates(batch, self.batch_size))
 
-    def loss(
+    def gradients(
         self, lstm: LSTM, controller: Controller, windows: Window, key: Key[Array, ""]
-    ) -> tuple[Float[Array, ""], Metrics]:
-        """The controller's losses on the beliefs that the LSTM forms."""
-        return self.controller_loss(controller, self.batch(lstm, windows), key)
+    ) -> tuple[tuple[LSTM, LSTM, Controller], Metrics]:
+        """Of J_V + J_Q in the LSTM, of J_π in the LSTM, and of all losses in the controller."""
+
+        def loss(d: Array, d_actor: Array, controller: Controller) -> tuple[Float[Array, ""], Metrics]:
+            return self.controller_loss(controller, self.batch(windows, d, d_actor), key)
+
+        d, pullback = jax.vjp(lambda lstm: self.beliefs(lstm, windows), lstm)
+        (by_d, by_d_actor, by_controller), metrics = jax.grad(loss, (0, 1, 2), has_aux=True)(d, d, controller)
+        return (*pullback(by_d), *pullback(by_d_actor), by_controller), metrics
 
     def update(self, state: State, batch: Window, key: Key[Array, ""]) -> tuple[State, Metrics]:
         """One update of the LSTM and the controller; the batch is windows."""
-        gradient = jax.grad(self.loss, (0, 1), has_aux=True)
-        (by_lstm, by_controller), metrics = gradient(state.lstm, state.controller, batch, key)
-        lstm, lstm_optimiser = descend(self.lstm_optimiser, by_lstm, state.lstm_optimiser, state.lstm)
+        (by_critics, by_actor, by_controller), metrics = self.gradients(state.lstm, state.controller, batch, key)
+        s_critics, s_actor = state.lstm_optimisers
+        lstm, s_critics = descend(self.lstm_optimiser, by_critics, s_critics, state.lstm)
+        lstm, s_actor = descend(self.lstm_optimiser, by_actor, s_actor, lstm)
         controller, controller_optimiser = update(
             self.optimisers, state.controller_optimiser, state.controller, by_controller, self.tau
         )
-        return State(lstm, controller, lstm_optimiser, controller_optimiser), metrics
+        return State(lstm, controller, (s_critics, s_actor), controller_optimiser), metrics
