@@ -70,6 +70,7 @@ def test_bench_all_prints_the_scalability_table(monkeypatch, capsys):
     assert set(json.loads(capsys.readouterr().out)) == set(agents.names())
 
 
+@pytest.mark.slow
 def test_bench_measures_an_agent_without_a_model():
     """Its begin_cycle only prepares the batch, so no time counts as a model's."""
     agent = agents.make("sac-mlp", step_start_rl=10, batch_size=4, policy_layers=(4,), value_layers=(4,))

@@ -120,6 +120,7 @@ def test_the_export_acts_the_same_with_jax_alone(name, tmp_path):
         np.testing.assert_allclose(np.array(line.split(), float), action.ravel(), rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_runs_policy_is_loaded_by_its_seed(tmp_path):
     options = {"steps": 12, "seeds": 2, "seed": 4, "eval_every": 12, "eval_episodes": 1}
     agent = agents.make("sac-mlp", policy_layers=(8,), value_layers=(8,), step_start_rl=10, pretrain_updates=0)

@@ -97,6 +97,7 @@ def learn(task, steps, seeds=1, **hyperparameters):
     return told.metrics, np.asarray(program.evaluate(seeds.state, keys).total)[:, 1].mean()
 
 
+@pytest.mark.slow
 def test_beyond_a_termination_there_is_no_value():
     metrics, _ = learn(Constant(ends=1), 800, gamma=0.5, **GREEDY)
     assert float(metrics["q"][0]) == pytest.approx(1.0, abs=0.05)
@@ -108,7 +109,7 @@ def test_beyond_a_time_limit_there_is_value():
     assert float(metrics["q"][0]) == pytest.approx(2.0, abs=0.1)
 
 
-@pytest.mark.parametrize("shown_in", ["obs", "reward"])
+@pytest.mark.parametrize("shown_in", [pytest.param("obs", marks=pytest.mark.slow), "reward"])
 def test_what_was_shown_once_is_remembered(shown_in):
     """Without memory the best mean return is 0, with it nearly 1."""
     _, total = learn(Recall(shown_in), 2000, **REMEMBERING)

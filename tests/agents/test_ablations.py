@@ -33,7 +33,9 @@ def made(name):
     return agent, state, window._replace(note=notes)
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize(
+    "name", [name if name == "vrm-single" else pytest.param(name, marks=pytest.mark.slow) for name in MODELS]
+)
 def test_it_has_its_models_and_each_learns_in_its_time(name):
     agent, state, window = made(name)
     there = MODELS[name].split()
@@ -113,6 +115,7 @@ def test_a_deterministic_models_loss_is_its_mean_squared_error(deterministic):
     assert set(metrics) == {"prediction_error"}
 
 
+@pytest.mark.slow
 def test_a_deterministic_models_gradient_agrees_with_finite_differences(deterministic):
     agent, state, window = deterministic
     agent = dataclasses.replace(agent, burn_in=0, seq_len=10)

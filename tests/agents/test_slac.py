@@ -117,6 +117,7 @@ def test_the_loops_gradient_is_that_of_plain_differentiation(state, moments, noi
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), *gradients)
 
 
+@pytest.mark.slow
 def test_the_gradient_of_the_elbo_agrees_with_finite_differences(state):
     window = windows(jax.random.key(1), 2, TIME)
     loss = jax.jit(lambda model: AGENT.model_loss(model, window, jax.random.key(2))[0])
@@ -164,6 +165,7 @@ def test_batches_are_aligned_in_time(state):
             np.testing.assert_array_equal(batch.belief[0, row], batch.next_belief[0, row - 2])
 
 
+@pytest.mark.slow
 def test_moments_that_do_not_exist_enter_no_loss(state):
     exists = jnp.ones((4, TIME), bool).at[:, 6:].set(False)
     results = changed_where_missing(AGENT, state, windows(jax.random.key(1), 4, TIME), exists)

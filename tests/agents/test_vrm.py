@@ -198,6 +198,7 @@ def test_batches_are_aligned_in_time(state):
         assert picked.reward == step.reward[now + 1]
 
 
+@pytest.mark.slow
 def test_moments_that_do_not_exist_enter_no_loss(state):
     exists = jnp.ones((12, 11), bool).at[:, 8:].set(False)
     here = windows(jax.random.key(1), 12, exists=exists)
