@@ -37,7 +37,7 @@ def trained(program, keys, cuts=(10, 10), learn=(10, 15), cycle=5):
 
 @pytest.fixture(
     scope="module",
-    params=[name if name in ("vrm", "sac-mlp") else pytest.param(name, marks=pytest.mark.slow) for name in SMALL],
+    params=[name if name == "vrm" else pytest.param(name, marks=pytest.mark.slow) for name in SMALL],
 )
 def small(request):
     """A small agent's training program and its agent's cycle."""
