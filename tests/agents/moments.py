@@ -7,6 +7,16 @@ import numpy as np
 from beliefrl.types import Spec, Step, Window
 
 SPEC = Spec(obs_dim=3, action_dim=2, max_steps=50)
+SMALL = {  # VRM
+    "d_size": 8,
+    "z_size": 4,
+    "hidden_size": 8,
+    "policy_layers": (8, 8),
+    "value_layers": (8, 8),
+    "seq_len": 6,
+    "batch_size": 2,
+    "burn_in": 4,
+}
 
 
 def windows(key, batch, time, is_first=None, exists=None):

@@ -7,20 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from agents.moments import SPEC, along, random_like, same, slope, windows
+from agents.moments import SMALL, SPEC, along, random_like, same, slope, windows
 from beliefrl import agents
 from beliefrl.types import UserError, perception, time_major
 
-SMALL = {
-    "d_size": 8,
-    "z_size": 4,
-    "hidden_size": 8,
-    "policy_layers": (8, 8),
-    "value_layers": (8, 8),
-    "seq_len": 6,
-    "batch_size": 2,
-    "burn_in": 4,
-}
 MODELS = {"vrm": "first keep", "vrm-single": "keep", "vrm-first": "first", "vrm-keep": "keep"}
 
 

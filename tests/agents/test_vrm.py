@@ -8,23 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from agents.moments import SMALL, SPEC, differ, same
 from beliefrl import agents
 from beliefrl.agents.vrm import VRMAgent
 from beliefrl.nets import draw
-from beliefrl.types import Spec, Step, UserError, Window, check_choice, time_major
+from beliefrl.types import Step, UserError, Window, check_choice, time_major
 from beliefrl.variational_model import VRM, Gaussian, Loop, LSTMState, _loop, _scan
 
-SMALL = {
-    "d_size": 8,
-    "z_size": 4,
-    "hidden_size": 8,
-    "policy_layers": (8, 8),
-    "value_layers": (8, 8),
-    "seq_len": 6,
-    "batch_size": 2,
-    "burn_in": 4,
-}
-SPEC = Spec(obs_dim=3, action_dim=2, max_steps=50)
 AGENT = VRMAgent(**SMALL)
 
 
@@ -47,16 +37,6 @@ def windows(key, batch, is_first=None, exists=None):
     )
     note = (jax.random.normal(keys[3], (batch, time, AGENT.d_size)),)
     return Window(step, note, ~none if exists is None else exists)
-
-
-def differ(a, b):
-    """Whether every array of two trees differs."""
-    return all(jax.tree.leaves(jax.tree.map(lambda x, y: bool(np.any(np.asarray(x) != np.asarray(y))), a, b)))
-
-
-def same(a, b):
-    """Whether two trees are equal to the last bit."""
-    return all(jax.tree.leaves(jax.tree.map(lambda x, y: bool(np.all(np.asarray(x) == np.asarray(y))), a, b)))
 
 
 def test_the_defaults_are_the_papers_tables():

@@ -4,9 +4,11 @@ import dataclasses
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Bool, Float, Key
 
+from beliefrl.nets import tanh_gaussian
 from beliefrl.soft_actor_critic import (
     Batch,
     Controller,
@@ -68,6 +70,14 @@ class SAC:
         """A new controller and its optimisers; `seen` is what the actor reads, where that is not the belief."""
         controller = init_controller(belief, action, self.policy_layers, self.value_layers, key, seen)
         return controller, init_optimisers(self.optimisers, controller)
+
+    def choose(
+        self, controller: Controller, seen: Float[Array, " seen"], key: Key[Array, ""], explore: Bool[Array, ""]
+    ) -> Float[Array, " action"]:
+        """An action: a sample of the policy, or its mode where not `explore`."""
+        mean, log_sigma = controller.actor(seen)
+        noise = jnp.where(explore, jax.random.normal(key, mean.shape), 0.0)
+        return tanh_gaussian(mean, log_sigma, noise)[0]
 
     def controller_loss(
         self, controller: Controller, batch: Batch, key: Key[Array, ""]

@@ -14,7 +14,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents.sac import SAC, Metrics, split_updates
-from beliefrl.nets import LSTM, LSTMState, descend, draw, tanh_gaussian
+from beliefrl.nets import LSTM, LSTMState, descend, draw
 from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState, update
 from beliefrl.types import Spec, Step, Window, WindowShape, check_range, time_major, transitions
 
@@ -106,9 +106,7 @@ class SACLSTMAgent(SAC):
         start = jax.tree.map(lambda leaf: leaf[None], memory)
         after = state.lstm.unroll(start, self.perception(step)[None, None], step.is_first[None, None])
         memory = jax.tree.map(lambda leaf: leaf[0, 0], after)
-        mean, log_sigma = state.controller.actor(memory.d)
-        noise = jnp.where(explore, jax.random.normal(key, mean.shape), 0.0)
-        return tanh_gaussian(mean, log_sigma, noise)[0], memory
+        return self.choose(state.controller, memory.d, key, explore), memory
 
     def note(self, memory: LSTMState) -> tuple[()]:
         return ()

@@ -8,11 +8,9 @@ import dataclasses
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents.sac import SAC, Metrics
-from beliefrl.nets import tanh_gaussian
 from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState
 from beliefrl.types import Spec, Step, Window, WindowShape, check_range, transitions
 
@@ -65,9 +63,7 @@ class SACMLPAgent(SAC):
     def act(
         self, state: State, memory: tuple[()], step: Step, key: Key[Array, ""], explore: Bool[Array, ""]
     ) -> tuple[Float[Array, " action"], tuple[()]]:
-        mean, log_sigma = state.controller.actor(step.obs)
-        noise = jnp.where(explore, jax.random.normal(key, mean.shape), 0.0)
-        return tanh_gaussian(mean, log_sigma, noise)[0], memory
+        return self.choose(state.controller, step.obs, key, explore), memory
 
     def note(self, memory: tuple[()]) -> tuple[()]:
         return ()

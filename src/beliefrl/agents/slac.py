@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents.sac import SAC, Metrics, split_updates
 from beliefrl.latent_model import LatentModel, Latents, elbo_terms
-from beliefrl.nets import descend, draw, tanh_gaussian
+from beliefrl.nets import descend, draw
 from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean
 from beliefrl.types import (
     Spec,
@@ -126,9 +126,7 @@ class SLACAgent(SAC):
     ) -> tuple[Float[Array, " action"], Float[Array, "history x"]]:
         x = perception(step)
         memory = jnp.where(step.is_first, x[None], jnp.concatenate([memory[1:], x[None]]))
-        mean, log_sigma = state.controller.actor(memory.ravel())
-        noise = jnp.where(explore, jax.random.normal(key, mean.shape), 0.0)
-        return tanh_gaussian(mean, log_sigma, noise)[0], memory
+        return self.choose(state.controller, memory.ravel(), key, explore), memory
 
     def note(self, memory: Float[Array, "history x"]) -> tuple[()]:
         return ()

@@ -22,7 +22,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents.sac import SAC, Metrics, split_updates
-from beliefrl.nets import LSTMState, descend, draw, tanh_gaussian
+from beliefrl.nets import LSTMState, descend, draw
 from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean
 from beliefrl.types import (
     Spec,
@@ -193,9 +193,7 @@ class VRMAgent(SAC):
             self.perceive(state.keep, memory.keep, step, key_keep, explore),
         )
         belief = jnp.concatenate([*(part.d for part in memory if part is not None), perception(step)])
-        mean, log_sigma = state.controller.actor(belief)
-        noise = jnp.where(explore, jax.random.normal(key_action, mean.shape), 0.0)
-        return tanh_gaussian(mean, log_sigma, noise)[0], memory
+        return self.choose(state.controller, belief, key_action, explore), memory
 
     def note(self, memory: Memory) -> tuple[Float[Array, " d"], ...]:
         """d_t of the first-impression model, or nothing."""
