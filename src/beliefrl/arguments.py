@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import difflib
 import io
+import json
 import re
 from collections.abc import Sequence
 from typing import Annotated, Any
@@ -50,6 +51,20 @@ def parse(options: Any, argv: Sequence[str], prog: str) -> Any:
     if unknown:
         raise UsageError(_unknown(options, unknown[0], prog))
     return parsed
+
+
+def named_values(given: Sequence[str], option: str) -> dict[str, Any]:
+    """{"name": value} of NAME=VALUE; a value is read as JSON, or else it is a string."""
+    values = {}
+    for each in given:
+        name, separator, value = each.partition("=")
+        if not (separator and name.isidentifier()):
+            raise UsageError(f"{option} {each} cannot be understood: write NAME=VALUE, such as max_episode_steps=500.")
+        try:
+            values[name] = json.loads({"True": "true", "False": "false", "None": "null"}.get(value, value))
+        except ValueError:
+            values[name] = value
+    return values
 
 
 WORDING = (  # tyro's, Python's, and ours

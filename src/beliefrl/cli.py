@@ -11,7 +11,7 @@ from typing import Annotated, Any, NoReturn
 
 import tyro
 
-from beliefrl.arguments import UsageError, agent_name, agent_options, parse
+from beliefrl.arguments import UsageError, agent_name, agent_options, named_values, parse
 
 STARTED = time.time()
 
@@ -32,6 +32,7 @@ for example
   beliefrl train vrm pendulum-v --steps 15000 --seeds 3 --out runs/first
   beliefrl evaluate runs/first --episodes 20
   beliefrl train vrm target-reaching --steps 60000 --gamma 0.98
+  beliefrl train vrm gym:MountainCarContinuous-v0 --observe 0 --seeds 2
 
 COMMAND --help shows the options of a command; `beliefrl train AGENT --help` also the agent's hyperparameters,
 with their defaults and where in the paper they stand.
@@ -91,6 +92,27 @@ def train(argv: Sequence[str]) -> None:
                 ],
                 dataclasses.MISSING,
             ),
+            "observe": (
+                Annotated[
+                    tuple[str, ...],
+                    tyro.conf.arg(
+                        metavar="ENTRIES",
+                        help="Entries of the observation that the agent sees: indices, or `velocities` or `positions` "
+                        "where the task says which they are. None given: all.",
+                    ),
+                ],
+                (),
+            ),
+            "constants": (
+                Annotated[
+                    tuple[str, ...],
+                    tyro.conf.arg(
+                        metavar="NAME=VALUE",
+                        help="Of a task's physics, or of a Gymnasium environment, such as max_episode_steps=500.",
+                    ),
+                ],
+                (),
+            ),
             "training": (Annotated[Options, tyro.conf.arg(name="", help="How long, how often.")], Options()),
             "out": (
                 Annotated[
@@ -102,7 +124,7 @@ def train(argv: Sequence[str]) -> None:
         },
     )
     options = parse(options_type, rest, f"beliefrl train {name}")
-    task = tasks.make(options.task)
+    task = tasks.make(options.task, options.observe or None, **named_values(options.constants, "--constants"))
     console = Console()
     with TrainingDisplay(console, options.training.steps) as display:
         run = run_training(options.agent, task, options.out, display, **dataclasses.asdict(options.training))
@@ -231,6 +253,8 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     from beliefrl.types import UserError
 
+    if "" not in sys.path:
+        sys.path.insert(0, "")  # as `python -m` has it: gym:my_module:MyEnv-v0 is in the folder one is in
     try:
         COMMANDS[argv[0]](argv[1:])
     except (UsageError, UserError) as error:

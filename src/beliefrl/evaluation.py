@@ -5,13 +5,16 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Array, Key
 
 from beliefrl import agents, tasks
 from beliefrl.agents import Agent
+from beliefrl.host_loop import Evaluation
 from beliefrl.phases import evaluate as evaluate_seed
 from beliefrl.rollout import Episode
 from beliefrl.runs import Run
 from beliefrl.tasks import Task
+from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.types import LARGEST, UserError
 
 MODES = ("sampled", "mode")  # how actions are chosen; the first axis of an evaluation's leaves behind seeds
@@ -37,7 +40,7 @@ def summary(result: Episode, has_success: bool) -> dict[str, Any]:
     return table
 
 
-def restore(run: Run, task: Task | None = None) -> tuple[Agent, Task, Any]:
+def restore(run: Run, task: Task | GymnasiumTask | None = None) -> tuple[Agent, Any, Any]:
     """The agent, the task and the trained states (leading axis: seed) of a run.
 
     `task` is needed only where the run was trained on a task of your own.
@@ -48,11 +51,11 @@ def restore(run: Run, task: Task | None = None) -> tuple[Agent, Task, Any]:
     config = run.config
     agent = agents.make(config["agent"], **_tuples(config["hyperparameters"]))
     if task is None:
-        if config["task"] not in tasks.names():
+        if not tasks.knows(config["task"]):
             raise UserError(
                 f"{run.folder} was trained on {config['task']}, which is not a task of this library: pass task=."
             )
-        task = tasks.make(config["task"], **_tuples(config["constants"]))
+        task = tasks.make(config["task"], config.get("observe"), **_tuples(config["constants"]))
     spec = task.spec
     keys = jax.random.split(jax.random.key(0), len(run.seeds))
     like = jax.eval_shape(jax.vmap(lambda key: agent.init(key, spec)), keys)
@@ -65,7 +68,7 @@ def _tuples(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def evaluate(
-    run: Run | str | os.PathLike[str], episodes: int = 20, seed: int = 0, task: Task | None = None
+    run: Run | str | os.PathLike[str], episodes: int = 20, seed: int = 0, task: Task | GymnasiumTask | None = None
 ) -> dict[str, Any]:
     """Let the trained agents of a run play `episodes` new episodes, once with sampled and once with mode actions.
 
@@ -89,5 +92,18 @@ def evaluate(
     run = run if isinstance(run, Run) else Run(run)
     agent, task, states = restore(run, task)
     keys = jax.random.split(jax.random.key(seed), len(run.seeds))
-    play = jax.jit(jax.vmap(lambda state, key: evaluate_seed(agent, task, state, key, episodes)))
-    return {"episodes": episodes} | summary(play(states, keys), task.spec.has_success)
+    if isinstance(task, GymnasiumTask):
+        result = _on_host(agent, task, states, keys, episodes, run.seeds)
+    else:
+        result = jax.jit(jax.vmap(lambda state, key: evaluate_seed(agent, task, state, key, episodes)))(states, keys)
+    return {"episodes": episodes} | summary(result, task.spec.has_success)
+
+
+def _on_host(
+    agent: Agent, task: GymnasiumTask, states: Any, keys: Key[Array, " seed"], episodes: int, seeds: list[int]
+) -> Episode:
+    evaluation = Evaluation(agent, task, seeds, "never")
+    try:
+        return evaluation.play(states, keys, episodes)
+    finally:
+        evaluation.close()

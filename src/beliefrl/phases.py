@@ -53,9 +53,14 @@ class Stretch(NamedTuple):
 def begin(agent: Agent, task: Task, capacity: int, key: Key[Array, ""]) -> Seed:
     """A seed before its first step; `capacity` moments fit its replay."""
     key_state, key_actor, key = jax.random.split(key, 3)
-    actor = rollout.begin(agent, task, key_actor)
-    replay = ring.init(rollout.moment(agent, actor), capacity)
-    return Seed(agent.init(key_state, task.spec), actor, replay, key)
+    return seed_of(agent, task.spec, capacity, rollout.begin(agent, task, key_actor), key_state, key)
+
+
+def seed_of(
+    agent: Agent, spec: Spec, capacity: int, actor: Actor, key_state: Key[Array, ""], key: Key[Array, ""]
+) -> Seed:
+    """A new agent and an empty replay for an actor at its first moment."""
+    return Seed(agent.init(key_state, spec), actor, ring.init(rollout.moment(agent, actor), capacity), key)
 
 
 def _no_episodes(agent: Agent) -> Episode:
@@ -68,8 +73,8 @@ def _write(log: Episode, index: Int[Array, ""], episode: Episode) -> Episode:
     return jax.tree.map(lambda column, entry: column.at[index].set(entry), log, episode)
 
 
-def _step_key(seed: Seed, step: Int[Array, ""], purpose: int) -> Key[Array, ""]:
-    return jax.random.fold_in(jax.random.fold_in(seed.key, purpose), step)
+def step_key(key: Key[Array, ""], step: Int[Array, ""], purpose: int) -> Key[Array, ""]:
+    return jax.random.fold_in(jax.random.fold_in(key, purpose), step)
 
 
 ACT, UPDATE, SAMPLE, CYCLE, PRETRAIN, RELIVE, EVALUATE = range(7)  # purposes of keys: no two share one
@@ -80,7 +85,7 @@ def explore(agent: Agent, task: Task, seed: Seed, first: Int[Array, ""], steps: 
 
     def step(i, carry):
         seed, log = carry
-        key = _step_key(seed, first + i, ACT)
+        key = step_key(seed.key, first + i, ACT)
         actor, replay, episode = rollout.advance(agent, task, seed.state, seed.actor, seed.replay, key)
         return seed._replace(actor=actor, replay=replay), _write(log, i, episode)
 
@@ -96,7 +101,7 @@ def pretrain(agent: Agent, seed: Seed, first: Int[Array, ""], updates: Int[Array
     """Updates `first` to `first + updates` of the pre-training; metrics are their means."""
 
     def update(seed: Seed, number: Int[Array, ""]) -> tuple[Seed, Metrics]:
-        key_sample, key = jax.random.split(_step_key(seed, number, PRETRAIN))
+        key_sample, key = jax.random.split(step_key(seed.key, number, PRETRAIN))
         windows = ring.sample(seed.replay, key_sample, agent.pretrain_windows, agent.window)
         state, metrics = agent.pretrain(seed.state, windows, key)
         return seed._replace(state=state), metrics
@@ -143,21 +148,27 @@ def _cycle(
 
     def act(step, carry):
         seed, log = carry
-        key = _step_key(seed, step, ACT)
+        key = step_key(seed.key, step, ACT)
         actor, replay, episode = rollout.advance(agent, task, seed.state, seed.actor, seed.replay, key)
         return seed._replace(actor=actor, replay=replay), _write(log, index + step - first, episode)
 
     seed, log = jax.lax.fori_loop(first, first + agent.cycle, act, (seed, log))
-    windows = ring.sample(seed.replay, _step_key(seed, first, SAMPLE), agent.cycle_windows, agent.window)
-    state, batches, model_metrics = agent.begin_cycle(seed.state, windows, _step_key(seed, first, CYCLE))
+    state, metrics = learn_cycle(agent, seed, first)
+    return seed._replace(state=state), log, metrics
+
+
+def learn_cycle(agent: Agent, seed: Seed, first: Int[Array, ""]) -> tuple[Any, Metrics]:
+    """What is learned when the steps of the cycle that began at environment step `first` are done: the new state."""
+    windows = ring.sample(seed.replay, step_key(seed.key, first, SAMPLE), agent.cycle_windows, agent.window)
+    state, batches, model_metrics = agent.begin_cycle(seed.state, windows, step_key(seed.key, first, CYCLE))
 
     def update(state, inputs):
         number, batch = inputs
-        return agent.update(state, batch, _step_key(seed, first + number, UPDATE))
+        return agent.update(state, batch, step_key(seed.key, first + number, UPDATE))
 
     updates = jnp.arange(agent.cycle // agent.train_interval_rl)
     state, metrics = jax.lax.scan(update, state, (updates, batches))
-    return seed._replace(state=state), log, model_metrics | jax.tree.map(jnp.mean, metrics)
+    return state, model_metrics | jax.tree.map(jnp.mean, metrics)
 
 
 def evaluate(agent: Agent, task: Task, state: Any, key: Key[Array, ""], episodes: int) -> Episode:
@@ -176,6 +187,7 @@ class Program(NamedTuple):
     relive: Callable[..., Seed]  # seeds
     learn: Callable[..., tuple[Seed, Stretch]]  # seeds, first, cycles
     evaluate: Callable[..., Episode]  # states (seed, ...), keys (seed,); leaves (seed, 2, episodes)
+    close: Callable[[], None] = lambda: None  # when no phase will be called any more
 
 
 def compile_program(agent: Agent, task: Task, capacity: int, episodes: int) -> Program:

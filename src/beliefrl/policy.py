@@ -20,6 +20,7 @@ from beliefrl.agents import Agent
 from beliefrl.evaluation import restore
 from beliefrl.runs import Run, write_whole
 from beliefrl.tasks import Task
+from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.types import LARGEST, Spec, Step, UserError
 
 State = tuple[np.ndarray, ...]
@@ -139,7 +140,7 @@ class Policy:
             raise UserError(f"{path} cannot be written ({error.strerror}): choose another file.") from None
 
 
-def load(run: Run | str | os.PathLike[str], seed: int | None = None, task: Task | None = None) -> Policy:
+def load(run: Run | str | os.PathLike[str], seed: int | None = None, task: Task | GymnasiumTask | None = None) -> Policy:
     """The policy that a run has learned.
 
     Args:

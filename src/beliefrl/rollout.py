@@ -53,17 +53,21 @@ def _strong(actor: Actor) -> Actor:
     return jax.tree.map(cast, actor)
 
 
-def begin(agent: Agent, task: Task, key: Key[Array, ""]) -> Actor:
+def first(agent: Agent, spec: Spec, task_state: Any, obs: Float[Array, " obs"]) -> Actor:
     """The first moment of an episode: no reward, no action before it, an empty memory."""
-    task_state, obs = task.reset(key)
     step = Step(
         obs=obs,
         reward=jnp.array(0.0),
-        prev_action=jnp.zeros(task.spec.action_dim),
+        prev_action=jnp.zeros(spec.action_dim),
         is_first=jnp.array(True),
         terminated=jnp.array(False),
     )
-    return _strong(Actor(task_state, step, agent.reset(task.spec), jnp.array(0), jnp.array(0.0)))
+    return _strong(Actor(task_state, step, agent.reset(spec), jnp.array(0), jnp.array(0.0)))
+
+
+def begin(agent: Agent, task: Task, key: Key[Array, ""]) -> Actor:
+    """An episode begins."""
+    return first(agent, task.spec, *task.reset(key))
 
 
 def moment(agent: Agent, actor: Actor) -> Moment:
@@ -71,17 +75,56 @@ def moment(agent: Agent, actor: Actor) -> Moment:
     return Moment(actor.step, agent.note(actor.memory))
 
 
+def act(
+    agent: Agent, state: Any, actor: Actor, key: Key[Array, ""], explore: Bool[Array, ""]
+) -> tuple[Float[Array, " action"], Any]:
+    """The action at the moment in hand, and the memory that has perceived it; `key` is that of `move`."""
+    key_act, _ = jax.random.split(key)
+    return agent.act(state, actor.memory, actor.step, key_act, explore)
+
+
+def arrive(
+    actor: Actor,
+    memory: Any,
+    action: Float[Array, " action"],
+    task_state: Any,
+    obs: Float[Array, " obs"],
+    reward: Float[Array, ""],
+    terminated: Bool[Array, ""],
+) -> Actor:
+    """The next moment, terminal or not; its memory is of the one before."""
+    step = Step(obs, reward, action, jnp.array(False), terminated)
+    return _strong(Actor(task_state, step, memory, actor.length + 1, actor.total + reward))
+
+
 def move(
     agent: Agent, task: Task, state: Any, actor: Actor, key: Key[Array, ""], explore: Bool[Array, ""]
-) -> tuple[Actor, Episode, Any]:
-    """Act and step; returns the actor at the next moment (terminal or not), and its memory of the one before."""
-    key_act, key_task = jax.random.split(key)
-    action, memory = agent.act(state, actor.memory, actor.step, key_act, explore)
+) -> tuple[Actor, Episode]:
+    """Act and step; returns the actor at the next moment."""
+    action, memory = act(agent, state, actor, key, explore)
+    _, key_task = jax.random.split(key)
     task_state, obs, reward, terminated = task.step(actor.task_state, action, key_task)
-    step = Step(obs, reward, action, jnp.array(False), terminated)
-    after = _strong(Actor(task_state, step, memory, actor.length + 1, actor.total + reward))
+    after = arrive(actor, memory, action, task_state, obs, reward, terminated)
     done = terminated | (after.length >= task.spec.max_steps)
-    return after, Episode(done, after.total, after.length, task.success(task_state)), memory
+    return after, Episode(done, after.total, after.length, task.success(task_state))
+
+
+def record(
+    agent: Agent,
+    state: Any,
+    replay: Replay,
+    actor: Actor,
+    after: Actor,
+    fresh: Actor,
+    done: Bool[Array, ""],
+    key: Key[Array, ""],
+) -> tuple[Actor, Replay]:
+    """Keep the moment that was in hand, and the one `after` it where it is the last; returns what is in hand now."""
+    replay = ring.add(replay, Moment(actor.step, agent.note(after.memory)))
+    # Only its note is used: where that needs no action, XLA drops the acting.
+    _, last = agent.act(state, after.memory, after.step, key, jnp.array(True))
+    replay = ring.add(replay, Moment(after.step, agent.note(last)), done)
+    return jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, after), replay
 
 
 def advance(
@@ -89,15 +132,9 @@ def advance(
 ) -> tuple[Actor, Replay, Episode]:
     """One environment step of training, recorded."""
     key_move, key_last, key_reset = jax.random.split(key, 3)
-    explore = jnp.array(True)
-    after, episode, memory = move(agent, task, state, actor, key_move, explore)
-    replay = ring.add(replay, Moment(actor.step, agent.note(memory)))
-    # Only its note is used: where that needs no action, XLA drops the acting.
-    _, last = agent.act(state, memory, after.step, key_last, explore)
-    replay = ring.add(replay, Moment(after.step, agent.note(last)), episode.done)
+    after, episode = move(agent, task, state, actor, key_move, jnp.array(True))
     fresh = begin(agent, task, key_reset)
-    actor = jax.tree.map(lambda new, old: jnp.where(episode.done, new, old), fresh, after)
-    return actor, replay, episode
+    return *record(agent, state, replay, actor, after, fresh, episode.done, key_last), episode
 
 
 def relive(
@@ -136,7 +173,7 @@ def evaluate(agent: Agent, task: Task, state: Any, key: Key[Array, ""], explore:
     def step(carry):
         time, actors, result = carry
         keys = jax.random.split(jax.random.fold_in(key_steps, time), episodes)
-        actors, now, _ = jax.vmap(lambda actor, key, explore: move(agent, task, state, actor, key, explore))(
+        actors, now = jax.vmap(lambda actor, key, explore: move(agent, task, state, actor, key, explore))(
             actors, keys, explore
         )
         result = jax.tree.map(lambda old, new: jnp.where(result.done, old, new), result, now)

@@ -115,7 +115,7 @@ class Recorder(Run):
         try:
             folder.mkdir(parents=True)
             (folder / "metrics").mkdir()
-            write_whole(folder / "config.json", (json.dumps(config, indent=2) + "\n").encode())
+            write_whole(folder / "config.json", (json.dumps(config, indent=2, default=str) + "\n").encode())
         except FileExistsError:
             raise UserError(f"{folder} exists already: choose another --out.") from None
         except OSError as error:

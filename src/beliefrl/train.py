@@ -12,15 +12,17 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from beliefrl import agents, phases, runs, tasks
+from beliefrl import agents, host_loop, phases, runs, tasks
 from beliefrl.agents import Agent
 from beliefrl.analysis.curves import draw_curve
 from beliefrl.evaluation import MODES, MOST_EPISODES, summary
-from beliefrl.phases import Metrics
+from beliefrl.phases import Metrics, Program
 from beliefrl.rollout import Episode
 from beliefrl.runs import Recorder, Run
 from beliefrl.tasks import Task
-from beliefrl.types import UserError, check_range
+from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
+from beliefrl.lockstep import PROCESSES
+from beliefrl.types import UserError, check_choice, check_range
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,6 +41,9 @@ class Options:
     """Episodes of each evaluation, with sampled actions and again with mode actions."""
     replay_capacity: int = 1_000_000
     """Most moments that a seed's replay keeps; the oldest make room."""
+    processes: str = "auto"
+    """Gymnasium environments: a process for each ("always"), none ("never"), or where that pays ("auto"; a Python script
+    that means "always" must begin under `if __name__ == "__main__":`)."""
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
@@ -46,6 +51,7 @@ class Options:
         check_range(self, ("eval_episodes",), 1, MOST_EPISODES)
         check_range(self, ("seeds",), 1, 10_000)
         check_range(self, ("seed",), 0, 2_000_000_000)
+        check_choice(self, "processes", PROCESSES)
 
 
 class Event(NamedTuple):
@@ -56,14 +62,35 @@ class Event(NamedTuple):
     metrics: Metrics = {}  # leaves (seed,): means over the last stretch
     episodes: Episode | None = None  # leaves (seed, stretch)
     evaluation: Episode | None = None  # leaves (seed, mode, episodes)
-    states: Any = None  # the agents, with an evaluation
+    states: Any = None  # the agents, where they are to be saved
     part: tuple[int, int] | None = None  # of the pre-training: updates done, of how many
 
 
-def stages(agent: Agent, task: Task, options: Options) -> Iterator[Event]:
-    """Train; yields an Event before whatever takes long and after whatever gave something to tell."""
+def stages(agent: Agent, task: Task | GymnasiumTask, options: Options) -> Iterator[Event]:
+    """Train; yields an Event before whatever takes long and after whatever gave something to tell.
+
+    Raises:
+        Fault: of a Gymnasium environment, after an Event with what was learned until then.
+    """
+    numbers = range(options.seed, options.seed + options.seeds)
+    sizes = _capacity(agent, options), options.eval_episodes
+    if isinstance(task, GymnasiumTask):
+        program = host_loop.program(agent, task, *sizes, numbers, options.processes)
+    else:
+        program = phases.compile_program(agent, task, *sizes)
+    try:
+        yield from _stages(agent, program, options)
+    except Fault as fault:
+        if fault.seeds is not None:
+            metrics, episodes = fault.told or ({}, None)
+            yield Event("stopped by a fault", fault.step, metrics, episodes, states=fault.seeds.state)
+        raise
+    finally:
+        program.close()
+
+
+def _stages(agent: Agent, program: Program, options: Options) -> Iterator[Event]:
     start = min(agent.step_start_rl, options.steps)
-    program = phases.compile_program(agent, task, _capacity(agent, options), options.eval_episodes)
     keys = jax.vmap(jax.random.key)(np.arange(options.seed, options.seed + options.seeds))
     stretch = phases.stretch_length(agent)
 
@@ -116,16 +143,20 @@ def _until(step: int, every: int) -> int:
     return every - step % every
 
 
-def _evaluation(program: phases.Program, seeds: phases.Seed, step: int) -> Iterator[Event]:
+def _evaluation(program: Program, seeds: phases.Seed, step: int) -> Iterator[Event]:
     yield Event("evaluating", step)
     keys = jax.vmap(lambda key: jax.random.fold_in(jax.random.fold_in(key, phases.EVALUATE), step))(seeds.key)
-    result = program.evaluate(seeds.state, keys)
+    try:
+        result = program.evaluate(seeds.state, keys)
+    except Fault as fault:
+        fault.seeds, fault.step = seeds, step
+        raise
     yield Event("learning", step, evaluation=result, states=seeds.state)
 
 
 def train(
     agent: Agent | str,
-    task: Task | str,
+    task: Task | GymnasiumTask | str,
     out: str | os.PathLike[str] | None = None,
     report: Callable[[Event], None] | None = None,
     **options: Any,
@@ -137,13 +168,14 @@ def train(
         task: a task, or the name of one.
         out: the run's folder, which must not exist; None is runs/AGENT-TASK-1, or the next free number.
         report: called with every Event as it happens, for progress.
-        options: the fields of `Options`: steps, seeds, seed, eval_every, eval_episodes, replay_capacity.
+        options: the fields of `Options`: steps, seeds, seed, eval_every, eval_episodes, replay_capacity, processes.
 
     Returns:
         The finished run: its results, its log, its files (`runs`).
 
     Raises:
-        UserError: an unknown name or option, an impossible value, or `out` exists.
+        UserError: an unknown name or option, an impossible value, `out` exists, or a Gymnasium environment did what
+            none may do; then what was learned and logged until that step is saved.
     """
     agent = agents.make(agent) if isinstance(agent, str) else agent
     task = tasks.make(task) if isinstance(task, str) else task
@@ -152,7 +184,8 @@ def train(
         if name not in known:
             raise UserError(f"Training has no option {name!r}: it has {', '.join(known)}.")
     chosen = Options(**options)
-    _capacity(agent, chosen)  # complains before there is a folder
+    _capacity(agent, chosen)  # complains before there is a folder, as the next line does
+    spec = task.spec
     config = {
         "agent": agents.name_of(agent),
         "hyperparameters": dataclasses.asdict(agent),  # pyright: ignore[reportArgumentType]
@@ -164,7 +197,7 @@ def train(
     results = None
     try:
         for event in stages(agent, task, chosen):
-            results = _record(recorder, event, task.spec.has_success) or results
+            results = _record(recorder, event, spec.has_success) or results
             if report is not None:
                 report(event)
     finally:
@@ -189,10 +222,11 @@ def _record(recorder: Recorder, event: Event, has_success: bool) -> dict[str, An
         if event.evaluation is not None:
             result = jax.tree.map(lambda leaf, index=index: np.asarray(leaf[index]), event.evaluation)
             recorder.log(seed, "evaluation", event.step, _evaluated(result, has_success))
+    if event.states is not None:
+        recorder.flush()
+        recorder.save(event.states)
     if event.evaluation is None:
         return None
-    recorder.flush()
-    recorder.save(event.states)
     return {"step": event.step} | summary(event.evaluation, has_success)
 
 

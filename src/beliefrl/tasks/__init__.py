@@ -2,12 +2,15 @@
 
 import dataclasses
 import difflib
+from collections.abc import Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
+from beliefrl.tasks import registered
 from beliefrl.tasks.cartpole import CartPole
+from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.pendulum import Pendulum
 from beliefrl.tasks.target_reaching import TargetReaching
 from beliefrl.types import Spec, UserError
@@ -68,7 +71,7 @@ class Observed:
         return self.task.success(state)
 
 
-def observe(task: Task, indices: tuple[int, ...]) -> Observed:
+def observe(task: Any, indices: tuple[int, ...]) -> Any:
     """The same task of which only the entries `indices` of the observation are seen.
 
     Raises:
@@ -79,6 +82,9 @@ def observe(task: Task, indices: tuple[int, ...]) -> Observed:
         raise UserError(
             f"observe={tuple(indices)} does not fit an observation of {size}: give indices from 0 to {size - 1}."
         )
+    if isinstance(task, GymnasiumTask):
+        seen = range(size) if task.indices is None else task.indices
+        return dataclasses.replace(task, indices=tuple(seen[i] for i in indices))
     return Observed(task, tuple(indices))
 
 
@@ -94,50 +100,119 @@ def names() -> dict[str, str]:
     """Every task's name with a sentence on it, in the order of the paper's table (Appendix B)."""
     listed = {}
     for name, task in TASKS.items():
-        about = (task.__doc__ or "").split("\n")[0]
-        listed[name] = about
-        if hasattr(task, "VELOCITIES"):
-            listed[f"{name}-v"] = f"{name}, velocities only: entries {_spaced(task.VELOCITIES)} of its observation"
-            listed[f"{name}-p"] = f"{name}, no velocities: entries {_spaced(task.POSITIONS)} of its observation"
+        listed |= _masked(name, (task.__doc__ or "").split("\n")[0], task)
+    for name, robot in registered.ROBOTS.items():
+        listed |= _masked(name, robot.about + " Needs the extra `robots`.", robot)
     return listed
+
+
+def knows(name: str) -> bool:
+    """Whether `make` may know a task of that name."""
+    return name.startswith(registered.PREFIX) or name in names()
+
+
+def _masked(name: str, about: str, task: Any) -> dict[str, str]:
+    """The task and its versions with a part of the observation."""
+    velocities, positions = masks(task)
+    listed = {name: about}
+    if velocities:
+        listed[f"{name}-v"] = f"{name}, velocities only: entries {_spaced(velocities)} of its observation"
+        listed[f"{name}-p"] = f"{name}, no velocities: entries {_spaced(positions)} of its observation"
+    return listed
+
+
+def masks(task: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Which entries of the observation are velocities, and which are not; nothing of a task that does not say."""
+    if isinstance(task, registered.Known):
+        return task.velocities, task.positions
+    return getattr(task, "VELOCITIES", ()), getattr(task, "POSITIONS", ())
 
 
 def _spaced(indices: tuple[int, ...]) -> str:
     return ", ".join(map(str, indices))
 
 
-def make(name: str, **constants: Any) -> Task:
-    """The task of that name; `constants` replace its physical constants.
+def make(name: str, observe: Sequence[int | str] | str | None = None, **constants: Any) -> Any:
+    """The task of that name.
 
-    "pendulum-v" is pendulum with velocities only, "pendulum-p" (positions) without velocities.
+    "pendulum-v" is pendulum with velocities only, "pendulum-p" (positions) without velocities. "gym:ID" is any
+    Gymnasium environment, "gym:PACKAGE:ID" one that a package registers.
+
+    Args:
+        name: of the task.
+        observe: entries of the observation that the agent sees, in that order, or "velocities" or "positions" where the
+            task says which they are; None is all.
+        constants: replace the task's physical constants, or are gymnasium.make's arguments.
 
     Raises:
-        UserError: no task has that name, or it has no such constant.
+        UserError: no task has that name, it has no such constant, or `observe` does not fit it.
     """
+    task = _make(name, constants)
+    return task if observe is None else _observed(task, _indices(name, observe))
+
+
+def _make(name: str, constants: dict[str, Any]) -> Any:
+    if name.startswith(registered.PREFIX):
+        return registered.make(name.removeprefix(registered.PREFIX), constants)
     known = names()
     if name not in known:
         near = difflib.get_close_matches(name, known, n=1)
         hint = f"did you mean {near[0]}?" if near else "`beliefrl tasks` lists them all."
         raise UserError(f"There is no task {name!r}: {hint}")
-    base, mask = (name[:-2], name[-2:]) if name[-2:] in MASKS else (name, "")
+    base, mask = (name[:-2], MASKS[name[-2:]]) if name[-2:] in MASKS else (name, None)
+    if base in registered.ROBOTS:
+        robot = registered.ROBOTS[base]
+        task = registered.make(robot.id, constants, name)
+        return task if mask is None else dataclasses.replace(task, indices=getattr(robot, mask))
     fields = [field.name for field in dataclasses.fields(TASKS[base])]
     for constant in constants:
         if constant not in fields:
             raise UserError(f"The task {base} has no constant {constant!r}: it has {', '.join(fields)}.")
     task = TASKS[base](**constants)
-    if not mask:
-        return task
-    return observe(task, task.VELOCITIES if mask == "-v" else task.POSITIONS)
+    return task if mask is None else Observed(task, getattr(task, mask.upper()))
+
+
+def _observed(task: Any, indices: tuple[int, ...]) -> Any:
+    return observe(task, indices)  # in `make` this word is an argument
+
+
+def _indices(name: str, observe: Sequence[int | str] | str) -> tuple[int, ...]:
+    """What `observe` means for the task of that name."""
+    given = [observe] if isinstance(observe, str) else list(observe)
+    if len(given) == 1 and given[0] in MASKS.values():
+        of = registered.KNOWN.get(name.removeprefix(registered.PREFIX), registered.ROBOTS.get(name, TASKS.get(name)))
+        velocities, positions = masks(of)
+        if not velocities:
+            raise UserError(f"{name} does not say which of its observations are {given[0]}: give their indices.")
+        return velocities if given[0] == "velocities" else positions
+    try:
+        return tuple(int(entry) for entry in given)
+    except ValueError:
+        raise UserError(
+            f"observe={' '.join(map(str, given))} cannot be understood: give indices, or velocities, or positions."
+        ) from None
 
 
 def describe(task: Any) -> dict[str, Any]:
-    """{"task": the name for `make`, "constants": what it was made with}.
+    """{"task": the name for `make`, "constants": what it was made with, "observe": the indices, if given apart}.
 
     A task that `make` cannot make is named module:Class, and has no constants.
     """
+    if isinstance(task, GymnasiumTask):
+        return _describe_gymnasium(task)
     base, indices = (task.task, task.indices) if isinstance(task, Observed) else (task, None)
-    masks = {None: "", getattr(base, "VELOCITIES", ()): "-v", getattr(base, "POSITIONS", ()): "-p"}
     for name, known in TASKS.items():
-        if type(base) is known and indices in masks:
-            return {"task": name + masks[indices], "constants": dataclasses.asdict(base)}
-    return {"task": f"{type(task).__module__}:{type(task).__qualname__}", "constants": {}}
+        velocities, positions = masks(known)
+        suffix = {None: "", velocities: "-v", positions: "-p"}.get(indices)
+        if type(base) is known and suffix is not None:
+            return {"task": name + suffix, "constants": dataclasses.asdict(base), "observe": None}
+    if isinstance(task, Observed):
+        return describe(task.task) | {"observe": list(task.indices)}
+    return {"task": f"{type(task).__module__}:{type(task).__qualname__}", "constants": {}, "observe": None}
+
+
+def _describe_gymnasium(task: GymnasiumTask) -> dict[str, Any]:
+    robot = registered.ROBOTS.get(task.name.removesuffix("-v").removesuffix("-p"))
+    whole = robot is not None and task.indices == {"-v": robot.velocities, "-p": robot.positions}.get(task.name[-2:])
+    observe = None if whole or task.indices is None else list(task.indices)
+    return {"task": task.name, "constants": dict(task.arguments), "observe": observe}

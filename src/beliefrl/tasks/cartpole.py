@@ -7,12 +7,14 @@ temp = (F + m_p l θ̇² sin θ) / m,   F = 30 a,   m = m_c + m_p
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
+from beliefrl.drawing import BLUE, GREY, INK, PALE, RED, Circle, Line, Picture, Polygon
 from beliefrl.types import Spec
 
 
@@ -68,3 +70,24 @@ class CartPole:
 
     def success(self, state: CartPoleState) -> Bool[Array, ""]:
         return jnp.array(False)
+
+    def draw(self, states: Sequence[CartPoleState]) -> Picture:
+        """The cart on its track, whose ends it must not pass, and the pole in the angle it must not leave."""
+        x, theta = float(states[-1].x), float(states[-1].theta)
+        size = 2 * self.half_length
+        hinge = (x, 0.0)
+
+        def tip(angle: float, length: float = size) -> tuple[float, float]:
+            return x + length * math.sin(angle), length * math.cos(angle)
+
+        room = [tip(share * self.max_theta, 1.15 * size) for share in (-1.0, -0.5, 0.0, 0.5, 1.0)]
+        shapes = [
+            Polygon([hinge, *room], PALE),
+            Line([(-self.max_x, -0.2), (self.max_x, -0.2)], 0.03, INK),
+            *(Line([(end, -0.3), (end, -0.1)], 0.05, RED) for end in (-self.max_x, self.max_x)),
+            Polygon([(x - 0.28, -0.12), (x + 0.28, -0.12), (x + 0.28, 0.1), (x - 0.28, 0.1)], INK),
+            *(Circle((x + side, -0.11), 0.075, GREY) for side in (-0.16, 0.16)),
+            Line([hinge, tip(theta)], 0.09, BLUE),
+            Circle(hinge, 0.03, PALE),
+        ]
+        return Picture((-self.max_x - 0.4, -0.45), (self.max_x + 0.4, 1.15 * size + 0.15), shapes, pixels=640)

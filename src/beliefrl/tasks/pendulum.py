@@ -5,12 +5,15 @@ r = -(θ² + 0.1 θ̇² + 0.001 u²),   with θ wrapped to [-π, π)
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
+from beliefrl.drawing import BLUE, INK, PALE, Circle, Line, Picture
 from beliefrl.types import Spec
 
 
@@ -61,3 +64,16 @@ class Pendulum:
 
     def success(self, state: PendulumState) -> Bool[Array, ""]:
         return jnp.array(False)
+
+    def draw(self, states: Sequence[PendulumState]) -> Picture:
+        """The rod on its hub, and the way its tip has come in the last half second; θ grows anticlockwise."""
+        angles = np.array([state.theta for state in states[-round(0.5 / self.dt) - 1 :]])
+        fine = np.interp(np.linspace(0, len(angles) - 1, 8 * len(angles)), np.arange(len(angles)), angles)
+        way = self.length * np.stack([-np.sin(fine), np.cos(fine)], axis=-1)
+        size, hub = self.length, (0.0, 0.0)
+        shapes = [
+            Line(way, 0.08 * size, PALE),
+            Line([hub, way[-1]], 0.17 * size, BLUE),
+            Circle(hub, 0.045 * size, INK),
+        ]
+        return Picture((-1.3 * size, -1.3 * size), (1.3 * size, 1.3 * size), shapes)

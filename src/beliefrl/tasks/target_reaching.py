@@ -8,12 +8,15 @@ the one that is due: what it has reached already it must remember.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from beliefrl.drawing import BLUE, GREEN, GREY, INK, PALE, PAPER, RED, Circle, Line, Picture, Polygon
 from beliefrl.types import Spec
 
 
@@ -111,3 +114,24 @@ class TargetReaching:
 
     def success(self, state: TargetReachingState) -> Bool[Array, ""]:
         return state.reached >= 3
+
+    def draw(self, states: Sequence[TargetReachingState]) -> Picture:
+        """The field, its targets with a tick where they are reached, and the robot with the way it has come."""
+        state, side, margin = states[-1], self.field, 0.04 * self.field
+        corners = [(0, 0), (side, 0), (side, side), (0, side), (0, 0)]
+        body, centre = 1.4 * self.radius, np.asarray(state.position)  # seen around the target that it is at
+        ahead = np.array([np.cos(state.heading), np.sin(state.heading)])
+        across = np.array([-ahead[1], ahead[0]])
+        shapes: list[Circle | Line | Polygon] = [
+            Line(corners, margin / 2, PALE),
+            Line([past.position for past in states], 0.2 * self.radius, GREY),
+            Circle(centre, body, INK),
+            Polygon([centre + 1.8 * body * ahead, centre + body * across, centre - body * across], INK),
+        ]
+        for index, colour in enumerate((RED, GREEN, BLUE)):
+            at = np.asarray(state.targets[index])
+            shapes.append(Circle(at, self.radius, colour))
+            if index < state.reached:
+                tick = np.array([(-0.45, 0.0), (-0.1, -0.35), (0.45, 0.35)]) * self.radius
+                shapes.append(Line(at + tick, 0.25 * self.radius, PAPER))
+        return Picture((-margin, -margin), (side + margin, side + margin), shapes)

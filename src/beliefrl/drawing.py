@@ -1,0 +1,113 @@
+"""Pictures of tasks: flat shapes in world coordinates, painted with Pillow. No display is needed."""
+
+import itertools
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image, ImageDraw
+
+from beliefrl.types import UserError
+
+Point = Sequence[Any]  # x to the right and y upwards, two numbers of any kind
+SMOOTH = 3  # painted so many times larger and averaged: Pillow's own edges are jagged
+
+PAPER, PALE, GREY, INK = "#fbfaf7", "#e4e1d8", "#a9a79e", "#2f3a45"
+RED, GREEN, BLUE = "#c8553d", "#4b9460", "#2a6f9e"
+
+
+class Circle(NamedTuple):
+    centre: Point
+    radius: float
+    colour: str
+
+
+class Line(NamedTuple):
+    """A line through one or more points, round at its ends and bends."""
+
+    points: Sequence[Point]
+    width: float
+    colour: str
+
+
+class Polygon(NamedTuple):
+    points: Sequence[Point]
+    colour: str
+
+
+class Picture(NamedTuple):
+    """Shapes in the units of the world, the first one undermost; colours as Pillow knows them, such as "#c8553d"."""
+
+    low: Point  # the world's corner at the picture's lower left
+    high: Point  # at its upper right
+    shapes: Sequence[Circle | Line | Polygon]
+    pixels: int = 480  # of the longer side
+
+
+def paint(picture: Picture) -> UInt8[np.ndarray, "height width 3"]:
+    """The picture as pixels in 0 to 255, the uppermost row first; both sides are even, as video encoders want them."""
+    low, high = np.asarray(picture.low, float), np.asarray(picture.high, float)
+    scale = picture.pixels / np.max(high - low)
+    width, height = 2 * np.ceil((high - low) * scale / 2 - 1e-6).astype(int)
+    image = Image.new("RGB", (int(width) * SMOOTH, int(height) * SMOOTH), PAPER)
+    canvas = ImageDraw.Draw(image)
+
+    def place(points: Sequence[Point]) -> list[tuple[float, float]]:
+        at = (np.asarray(points, float) - low) * scale * SMOOTH
+        return [(float(x), image.height - float(y)) for x, y in at]
+
+    def disc(x: float, y: float, radius: float, colour: str) -> None:
+        canvas.ellipse((x - radius, y - radius, x + radius, y + radius), colour)
+
+    def bar(points: list[tuple[float, float]], radius: float, colour: str) -> None:
+        # Pillow's own thick lines are a pixel narrower than they should be, and have flat ends.
+        for (x0, y0), (x1, y1) in itertools.pairwise(points):
+            length = math.hypot(x1 - x0, y1 - y0) or 1.0
+            dx, dy = radius * (y1 - y0) / length, radius * (x0 - x1) / length
+            canvas.polygon([(x0 + dx, y0 + dy), (x1 + dx, y1 + dy), (x1 - dx, y1 - dy), (x0 - dx, y0 - dy)], colour)
+        for x, y in points:
+            disc(x, y, radius, colour)
+
+    for shape in picture.shapes:
+        match shape:
+            case Circle(centre, radius, colour):
+                disc(*place([centre])[0], float(radius) * scale * SMOOTH, colour)
+            case Line(points, width, colour):
+                bar(place(points), float(width) * scale * SMOOTH / 2, colour)
+            case Polygon(points, colour):
+                canvas.polygon(place(points), colour)
+    return np.array(image.reduce(SMOOTH))
+
+
+class Window:
+    """A window that shows pictures, one after another; there can be one at a time."""
+
+    def __init__(self, title: str):
+        """Opens with the first picture.
+
+        Raises:
+            UserError: pygame is not installed.
+        """
+        try:
+            import pygame
+        except ImportError:
+            raise UserError("A window needs pygame: pip install 'beliefrl[render]'.") from None
+        self._pygame, self._title, self._clock = pygame, title, pygame.time.Clock()
+
+    def show(self, pixels: UInt8[np.ndarray, "height width 3"], fps: int) -> None:
+        """Show a picture, not before 1 / fps seconds have passed since the last one."""
+        height, width, _ = pixels.shape
+        screen = self._pygame.display.get_surface()
+        if screen is None:
+            self._pygame.display.init()
+            screen = self._pygame.display.set_mode((width, height))
+            self._pygame.display.set_caption(self._title)
+        self._pygame.event.pump()  # else the system takes the window for one that hangs
+        screen.blit(self._pygame.image.frombuffer(pixels.tobytes(), (width, height), "RGB"), (0, 0))
+        self._pygame.display.flip()
+        self._clock.tick(fps)
+
+    def close(self) -> None:
+        self._pygame.display.quit()

@@ -1,0 +1,250 @@
+"""Algorithm 1 where the environments run on the host: the phases of `phases`, with Gymnasium's environments in them.
+
+The agent acts, records and learns by the same functions as in the compiled loop; only the step of the task is outside:
+
+    act       compiled: the action of every seed
+    step      the environments, in lockstep
+    record    compiled: the moments go into the replays
+    ...       and when the steps of a cycle are done
+    learn     compiled: `phases.learn_cycle`
+
+A fault of an environment ends the training with what was learned and recorded until then.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from beliefrl import phases, rollout
+from beliefrl.agents import Agent
+from beliefrl.lockstep import Lockstep
+from beliefrl.phases import ACT, Metrics, Program, Seed, Stretch, step_key
+from beliefrl.replay import Replay
+from beliefrl.rollout import Actor, Episode
+from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
+from beliefrl.types import Spec, Step
+
+
+def program(
+    agent: Agent, task: GymnasiumTask, capacity: int, episodes: int, seeds: Sequence[int], processes: str
+) -> Program:
+    """The phases of training with environments of their own for each of `seeds`."""
+    loop = HostLoop(agent, task, capacity, seeds, processes)
+    evaluation = Evaluation(agent, task, seeds, processes)
+
+    def close() -> None:
+        loop.environments.close()
+        evaluation.close()
+
+    return Program(
+        begin=loop.begin,
+        explore=loop.explore,
+        pretrain=jax.jit(jax.vmap(partial(phases.pretrain, agent), in_axes=(0, None, None)), donate_argnums=0),
+        relive=jax.jit(jax.vmap(partial(phases.relive, agent, task.spec)), donate_argnums=0),
+        learn=loop.learn,
+        evaluate=partial(evaluation.play, episodes=episodes),
+        close=close,
+    )
+
+
+class Answer(NamedTuple):
+    """What the agent did, and what its environment answered."""
+
+    memory: Any
+    action: Float[Array, "*seed action"]
+    obs: Float[Array, "*seed obs"]
+    reward: Float[Array, "*seed"]
+    terminated: Bool[Array, "*seed"]
+    done: Bool[Array, "*seed"]
+    fresh: Float[Array, "*seed obs"]  # the first observation of the next episode, where done
+
+
+class HostLoop:
+    """The environments of a training, and what is compiled around them."""
+
+    def __init__(self, agent: Agent, task: GymnasiumTask, capacity: int, seeds: Sequence[int], processes: str):
+        """An environment for each of `seeds`."""
+        self.agent = agent
+        self.environments = Lockstep(task, [f"seed {seed}" for seed in seeds], processes)
+        self._begin = jax.jit(jax.vmap(partial(_begin, agent, task.spec, capacity)))
+        self._act = jax.jit(jax.vmap(partial(_act, agent), in_axes=(0, 0, 0, None)))
+        record = jax.vmap(partial(_record, agent, task.spec), in_axes=(0, 0, 0, 0, None, 0))
+        self._record = jax.jit(record, donate_argnums=1)
+        self._learn = jax.jit(jax.vmap(partial(phases.learn_cycle, agent), in_axes=(0, None)))
+
+    def begin(self, keys: Key[Array, " seed"]) -> Seed:
+        """Seeds before their first steps."""
+        return self._begin(keys, self.environments.reset(environment_seeds(keys)))
+
+    def explore(self, seeds: Seed, first: int, steps: int) -> tuple[Seed, Stretch]:
+        """Environment steps without updates."""
+        told = _Told()
+        for step in range(first, first + steps):
+            seeds = self._step(seeds, step, told)
+        return seeds, told.stretch()
+
+    def learn(self, seeds: Seed, first: int, cycles: int) -> tuple[Seed, Stretch]:
+        """`cycles` cycles of steps and updates from environment step `first` on."""
+        told = _Told()
+        for begins in range(first, first + cycles * self.agent.cycle, self.agent.cycle):
+            for step in range(begins, begins + self.agent.cycle):
+                seeds = self._step(seeds, step, told)
+            state, metrics = self._learn(seeds, begins)
+            seeds = seeds._replace(state=state)
+            told.metrics.append(metrics)
+        return seeds, told.stretch()
+
+    def _step(self, seeds: Seed, step: int, told: "_Told") -> Seed:
+        """One environment step of every seed, recorded."""
+        action, memory = self._act(seeds.state, seeds.actor, seeds.key, step)
+        try:
+            obs, reward, terminated, truncated, success = self.environments.step(np.asarray(action))
+            done = terminated | truncated
+            fresh = self.environments.restart(done) if done.any() else obs
+        except Fault as fault:
+            fault.seeds, fault.step, fault.told = seeds, step, told.stretch()
+            raise
+        answer = Answer(memory, action, obs, reward, terminated, done, fresh)
+        result = self._record(seeds.state, seeds.replay, seeds.actor, seeds.key, step, answer)
+        actor, replay, total, length = result
+        told.episodes.append((done, total, length, success))
+        return seeds._replace(actor=actor, replay=replay)
+
+
+class _Told:
+    """What a stretch tells, gathered on the way."""
+
+    def __init__(self):
+        self.metrics: list[Metrics] = []
+        self.episodes: list[tuple[Any, ...]] = []  # one a step: done, total, length, success of every seed
+
+    def stretch(self) -> Stretch:
+        """Means over its updates; episodes with leaves (seed, step)."""
+        metrics, columns = jax.device_get((self.metrics, list(zip(*self.episodes, strict=True))))
+        means = {name: np.mean([each[name] for each in metrics], axis=0) for name in (metrics[0] if metrics else {})}
+        none = np.zeros((1, 0))
+        return Stretch(means, Episode(*(np.stack(column, axis=1) for column in columns or [[none[0]]] * 4)))
+
+
+def environment_seeds(keys: Key[Array, "*lane"]) -> Int[np.ndarray, "*lane"]:
+    """A seed for the environment of each key."""
+    return np.asarray(jax.vmap(lambda key: jax.random.randint(key, (), 0, 2**31 - 1))(keys.reshape(-1))).reshape(
+        keys.shape
+    )
+
+
+def _begin(agent: Agent, spec: Spec, capacity: int, key: Key[Array, ""], obs: Float[Array, " obs"]) -> Seed:
+    key_state, _, key = jax.random.split(key, 3)
+    return phases.seed_of(agent, spec, capacity, rollout.first(agent, spec, (), obs), key_state, key)
+
+
+def _act(
+    agent: Agent, state: Any, actor: Actor, key: Key[Array, ""], step: Int[Array, ""]
+) -> tuple[Float[Array, " action"], Any]:
+    key_move, _, _ = jax.random.split(step_key(key, step, ACT), 3)
+    return rollout.act(agent, state, actor, key_move, jnp.array(True))
+
+
+def _record(
+    agent: Agent,
+    spec: Spec,
+    state: Any,
+    replay: Replay,
+    actor: Actor,
+    key: Key[Array, ""],
+    step: Int[Array, ""],
+    answer: Answer,
+) -> tuple[Actor, Replay, Float[Array, ""], Int[Array, ""]]:
+    """Record what the environment answered; the last two results are of the episode until then."""
+    _, key_last, _ = jax.random.split(step_key(key, step, ACT), 3)
+    after = rollout.arrive(actor, answer.memory, answer.action, (), answer.obs, answer.reward, answer.terminated)
+    begun = rollout.first(agent, spec, (), answer.fresh)
+    actor, replay = rollout.record(agent, state, replay, actor, after, begun, answer.done, key_last)
+    return actor, replay, after.total, after.length
+
+
+class Evaluation:
+    """Environments for evaluation: two for each seed, one played with sampled and one with mode actions."""
+
+    def __init__(self, agent: Agent, task: GymnasiumTask, seeds: Sequence[int], processes: str):
+        """They are made at the first evaluation."""
+        self.agent, self.task, self.seeds, self.processes = agent, task, seeds, processes
+        self.environments: Lockstep | None = None
+        lanes = jax.vmap(partial(_perceive, agent, task.spec), in_axes=(None, 0, 0, 0, 0, None))
+        self._perceive = jax.jit(jax.vmap(lanes, in_axes=(0, 0, 0, 0, None, None)))
+
+    def play(self, states: Any, keys: Key[Array, " seed"], episodes: int) -> Episode:
+        """`episodes` episodes, one after the other; leaves (seed, 2, episodes)."""
+        if self.environments is None:
+            lanes = [f"evaluation of seed {seed}" for seed in self.seeds for _ in range(2)]
+            self.environments = Lockstep(self.task, lanes, self.processes)
+        keys = jax.vmap(lambda key: jax.random.split(key, 2))(keys)
+        obs = self.environments.reset(environment_seeds(keys).reshape(-1))
+        lanes = len(obs)
+        action, none = np.zeros((lanes, self.task.spec.action_dim), np.float32), np.zeros(lanes, np.float32)
+        step = Step(obs, none, action, np.ones(lanes, bool), np.zeros(lanes, bool))
+        memory = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*keys.shape, *leaf.shape)), self._empty())
+        record, total, length = _Record(lanes, episodes), np.zeros(lanes), np.zeros(lanes, int)
+        explore, time = np.array([True, False]), 0
+        while not record.full:
+            perceived = jax.tree.map(lambda leaf: leaf.reshape(*keys.shape, *leaf.shape[1:]), step)
+            action, memory = self._perceive(states, memory, perceived, keys, explore, time)
+            action = np.asarray(action).reshape(lanes, -1)
+            obs, reward, terminated, truncated, success = self.environments.step(action)
+            total, length, done, time = total + reward, length + 1, terminated | truncated, time + 1
+            record.add(done, total, length, success)
+            if done.any():
+                obs = self.environments.restart(done)
+                total, length = np.where(done, 0.0, total), np.where(done, 0, length)
+            step = Step(obs, np.where(done, 0, reward), np.where(done[:, None], 0, action), done, step.terminated)
+        return jax.tree.map(lambda leaf: leaf.reshape(*keys.shape, episodes), record.episodes)
+
+    def close(self) -> None:
+        """Close the environments, if there are any."""
+        if self.environments is not None:
+            self.environments.close()
+
+    def _empty(self) -> Any:
+        return self.agent.reset(self.task.spec)
+
+
+def _perceive(
+    agent: Agent,
+    spec: Spec,
+    state: Any,
+    memory: Any,
+    step: Step,
+    key: Key[Array, ""],
+    explore: Bool[Array, ""],
+    time: Int[Array, ""],
+) -> tuple[Float[Array, " action"], Any]:
+    empty = agent.reset(spec)
+    memory = jax.tree.map(lambda new, old: jnp.where(step.is_first, new, old), empty, memory)
+    return agent.act(state, memory, step, jax.random.fold_in(key, time), explore)
+
+
+class _Record:
+    """The first episodes of every lane."""
+
+    def __init__(self, lanes: int, episodes: int):
+        shape = (lanes, episodes)
+        kinds = (bool, np.float32, np.int32, bool)
+        self.episodes = Episode(*(np.zeros(shape, kind) for kind in kinds))
+        self.count = np.zeros(lanes, int)
+
+    @property
+    def full(self) -> bool:
+        """Whether every lane has all its episodes."""
+        return bool(self.episodes.done.all())
+
+    def add(self, done: Any, *values: Any) -> None:
+        """What ended, where `done` and still wanted; values are Episode's other fields, leaves (lane,)."""
+        lanes = np.flatnonzero(done & (self.count < self.episodes.done.shape[1]))
+        for column, value in zip(self.episodes, (done, *values), strict=True):
+            column[lanes, self.count[lanes]] = value[lanes]
+        self.count[lanes] += 1

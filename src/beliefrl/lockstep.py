@@ -1,0 +1,145 @@
+"""Gymnasium environments side by side, one a lane, each in this process or in one of its own.
+
+An episode ends where its lane says so and begins again when it is told to: the last observation is seen as well.
+"""
+
+import contextlib
+import os
+import sys
+import time
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from gymnasium import logger
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from jaxtyping import Bool, Float, Int
+
+from beliefrl.tasks.gymnasium import Environment, Fault, GymnasiumTask
+from beliefrl.types import UserError
+
+HANDOVER = 5e-4  # seconds that giving a step to other processes costs, about
+PROCESSES = ("auto", "always", "never")
+
+
+class Lockstep:
+    """Environments of a task, all stepped together."""
+
+    def __init__(self, task: GymnasiumTask, lanes: Sequence[str], processes: str = "auto"):
+        """Make an environment for each of `lanes`, the names under which their faults are told.
+
+        Args:
+            task: what they are of.
+            lanes: for example "seed 0".
+            processes: "always" gives each a process of its own, "never" none, "auto" where that pays.
+
+        Raises:
+            UserError: the environment cannot be made, or is not supported.
+        """
+        self.task, self.lanes = task, lanes
+        self.steps = 0
+        factories = [_Factory(task, lane) for lane in lanes]
+        self.apart = processes == "always" or (processes == "auto" and _pays(task, len(lanes)))
+        with self._faults():
+            if self.apart:
+                # Forking a process in which JAX runs threads may never return.
+                self._envs = AsyncVectorEnv(factories, context="spawn", autoreset_mode=AutoresetMode.DISABLED)
+            else:
+                self._envs = SyncVectorEnv(factories, autoreset_mode=AutoresetMode.DISABLED)
+
+    def reset(self, seeds: Int[np.ndarray, " lane"]) -> Float[np.ndarray, "lane obs"]:
+        """Begin an episode everywhere."""
+        with self._faults():
+            return self._envs.reset(seed=[int(seed) for seed in seeds])[0]
+
+    def step(
+        self, actions: Float[np.ndarray, "lane action"]
+    ) -> tuple[
+        Float[np.ndarray, "lane obs"],
+        Float[np.ndarray, " lane"],
+        Bool[np.ndarray, " lane"],
+        Bool[np.ndarray, " lane"],
+        Bool[np.ndarray, " lane"],
+    ]:
+        """Act everywhere; returns observations, rewards, terminated, truncated, success."""
+        self.steps += 1
+        with self._faults():
+            obs, reward, terminated, truncated, info = self._envs.step(actions)
+        return obs, reward.astype(np.float32), terminated, truncated, np.asarray(info["success"], bool)
+
+    def restart(self, done: Bool[np.ndarray, " lane"]) -> Float[np.ndarray, "lane obs"]:
+        """Begin an episode where one is done; returns what is observed everywhere."""
+        with self._faults():
+            return self._envs.reset(options={"reset_mask": done})[0]
+
+    def close(self) -> None:
+        """Close them all; what goes wrong in that concerns nobody any more."""
+        with contextlib.suppress(Exception), _silence():
+            self._envs.close(**({"terminate": True} if self.apart else {}))
+
+    @contextlib.contextmanager
+    def _faults(self) -> Iterator[None]:
+        """A lane's process that has died is a Fault."""
+        try:
+            with _silence():
+                yield
+        except (EOFError, ConnectionError, BrokenPipeError):
+            raise Fault(self._death()) from None
+
+    def _death(self) -> str:
+        dead = []
+        for lane, process in zip(self.lanes, self._envs.processes, strict=True) if hasattr(self, "_envs") else ():
+            process.join(timeout=0.5)
+            if not process.is_alive():
+                dead.append(f"{lane} (exit code {process.exitcode})")
+        who = " and ".join(dead) or "one of them"
+        return f"{self.task.name} (step {self.steps}): the process of {who} has died, out of memory or killed."
+
+
+class _Factory:
+    """Makes one lane's environment, in whatever process."""
+
+    def __init__(self, task: GymnasiumTask, lane: str):
+        self.task, self.lane = task, lane
+
+    def __call__(self) -> Environment:
+        return self.task.environment(self.lane)
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Gymnasium prints a worker's traceback; its sentence is told anyway."""
+    level, logger.min_level = logger.min_level, logger.ERROR + 1
+    try:
+        yield
+    finally:
+        logger.min_level = level
+
+
+def _pays(task: GymnasiumTask, lanes: int) -> bool:
+    """Whether processes of their own save more than they cost: by the time that some random steps take.
+
+    A process begins by importing the program that started it, so a script would train again in each unless it guards
+    against that; only from the command line is it sure to.
+    """
+    cores = min(lanes, os.cpu_count() or 1)
+    by_command = os.path.basename(sys.argv[0]) in ("beliefrl", "beliefrl.exe") or "beliefrl.cli" in sys.modules
+    return by_command and cores > 1 and lanes * step_seconds(task) * (1 - 1 / cores) > HANDOVER
+
+
+def step_seconds(task: GymnasiumTask, steps: int = 20) -> float:
+    """The median time of a step with random actions; 0 where that cannot be measured."""
+    try:
+        environment = task.environment()
+        environment.reset(seed=0)
+        actions = np.random.default_rng(0).uniform(-1, 1, (steps, *environment.action_space.shape))
+        times = []
+        for action in actions:
+            before = time.perf_counter()
+            _, _, terminated, truncated, _ = environment.step(action)
+            times.append(time.perf_counter() - before)
+            if terminated or truncated:
+                environment.reset()
+        environment.close()
+    except UserError:
+        return 0.0
+    return float(np.median(times))

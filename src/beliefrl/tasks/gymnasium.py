@@ -1,0 +1,264 @@
+"""Any Gymnasium environment as a task: observations flat and masked, actions in [-1, 1], faults put as sentences.
+
+Such a task runs on the host, not in a compiled program (`host_loop`). It is what it says to the agent: a `spec`, and
+environments in which an episode is what `rollout` means by one. All checks of what an environment returns are here.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from beliefrl.types import LARGEST, Spec, UserError
+
+ENDLESS = 10_000  # steps after which an episode without a time limit is taken for one that never ends
+
+
+class Fault(UserError):
+    """An environment did what none may do. Names the environment, the seed and the step."""
+
+    seeds: Any = None  # of a training: what was learned until then (`host_loop`)
+    step: int = 0
+    told: Any = None
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class GymnasiumTask:
+    """A Gymnasium environment with a bounded Box of actions and an observation that flattens to numbers."""
+
+    make: Callable[..., gymnasium.Env[Any, Any]]
+    """Makes one environment; called with `arguments`."""
+    name: str = ""
+    """What messages and runs call it; empty is the name of `make`."""
+    arguments: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Keyword arguments for `make`."""
+    indices: tuple[int, ...] | None = None
+    """Entries of the flat observation that the agent sees; None is all."""
+    max_steps: int | None = None
+    """Time limit in steps, which truncates; None is the environment's own."""
+    has_success: bool = False
+    """Whether its info says `is_success` or `success`, so that rates of it are logged."""
+
+    def __post_init__(self) -> None:
+        """Name it."""
+        if not self.name:
+            object.__setattr__(self, "name", getattr(self.make, "__qualname__", type(self.make).__name__))
+
+    @cached_property
+    def spec(self) -> Spec:
+        """Sizes of what the agent sees and does, and the time limit.
+
+        Raises:
+            UserError: it cannot be made, or its spaces are not supported.
+        """
+        environment = self.environment()
+        environment.close()
+        (obs,), (action,) = environment.observation_space.shape, environment.action_space.shape
+        return Spec(obs, action, environment.limit or LARGEST, self.has_success)
+
+    def environment(self, seed: str = "") -> "Environment":
+        """One of its environments as the agent sees it; `seed` is what faults say of whose it is.
+
+        Raises:
+            UserError: it cannot be made, or its spaces are not supported.
+        """
+        return Environment(self, seed)
+
+
+class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
+    """A Gymnasium environment as the agent sees it: the entries it observes, float32, and actions in [-1, 1].
+
+    Whatever goes wrong inside is a Fault that names the environment, the seed and the step.
+    """
+
+    def __init__(self, task: GymnasiumTask, seed: str = ""):
+        """Make it and check its spaces."""
+        self.task, self.seed = task, seed
+        self.steps, self.length = 0, 0  # since it was made, and of this episode
+        try:
+            self.inner = task.make(**task.arguments)
+        except UserError:
+            raise
+        except Exception as error:  # whatever a stranger's environment may raise
+            raise UserError(f"{task.name} cannot be made: {_said(error)}.") from None
+        self.inner_action_space, self.inner_observation_space = self.inner.action_space, self.inner.observation_space
+        size = flat_size(self.inner_observation_space, task.name)
+        self._check_actions(self.inner_action_space)
+        self.indices = np.arange(size) if task.indices is None else np.array(task.indices)
+        if self.indices.size == 0 or not np.all((self.indices >= 0) & (self.indices < size)):
+            raise UserError(
+                f"observe={task.indices} does not fit the observation of {task.name}, which has {size} numbers: "
+                f"give indices from 0 to {size - 1}."
+            )
+        self.observation_space = spaces.Box(-np.inf, np.inf, (self.indices.size,), np.float32)
+        self.action_space = spaces.Box(-1.0, 1.0, (int(np.prod(self.inner_action_space.shape)),), np.float32)
+        own = self.inner.spec.max_episode_steps if self.inner.spec else None
+        self.limit = task.max_steps or own
+
+    def _check_actions(self, space: Any) -> None:
+        name = self.task.name
+        if not isinstance(space, spaces.Box):
+            raise UserError(
+                f"{name} has the actions {_short(space)}: what is supported is a bounded Box of real numbers "
+                "(continuous control), not discrete or composite actions."
+            )
+        if not np.issubdtype(space.dtype, np.floating):
+            raise UserError(f"{name} has actions of type {space.dtype}: what is supported is a Box of real numbers.")
+        if space.shape == () or 0 in space.shape:
+            raise UserError(f"{name} has actions of shape {space.shape}: there must be at least one number in a row.")
+        if not space.is_bounded():
+            raise UserError(
+                f"{name} has unbounded actions: [-1, 1] is scaled to the bounds, so give its Box finite ones."
+            )
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin an episode."""
+        self.length = 0
+        result = self._call("reset", lambda: self.inner.reset(seed=seed, options=options))
+        if not (isinstance(result, tuple) and len(result) == 2):
+            raise self._fault("reset returned no pair (observation, info)")
+        return self._seen(result[0]), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Do an action in [-1, 1]."""
+        self.steps, self.length = self.steps + 1, self.length + 1
+        scaled = self._scaled(action)
+        result = self._call("step", lambda: self.inner.step(scaled))
+        if not (isinstance(result, tuple) and len(result) == 5):
+            raise self._fault("step returned no five (observation, reward, terminated, truncated, info)")
+        obs, reward, terminated, truncated, info = result
+        obs, reward = self._seen(obs), self._number(reward)
+        terminated, truncated = self._flag(terminated, "terminated"), self._flag(truncated, "truncated")
+        truncated = truncated or self.length == self.task.max_steps
+        if not (terminated or truncated) and self.length >= (self.limit or ENDLESS):
+            raise self._fault(
+                f"the episode has not ended after {self.length} steps: mend the environment, or give it a time limit "
+                "with max_episode_steps"
+            )
+        return obs, reward, terminated, truncated, {"success": success_of(info)}
+
+    def render(self) -> Any:
+        """What the environment itself renders."""
+        return self.inner.render()
+
+    def close(self) -> None:
+        """Close it; what goes wrong in that concerns nobody any more."""
+        try:
+            self.inner.close()
+        except Exception:
+            return
+
+    def _fault(self, what: str) -> Fault:
+        seed = f"{self.seed}, " if self.seed else ""
+        return Fault(f"{self.task.name} ({seed}step {self.steps}): {what}.")
+
+    def _call(self, name: str, function: Callable[[], Any]) -> Any:
+        try:
+            result = function()
+        except (Exception, SystemExit) as error:  # whatever a stranger's environment may raise
+            raise self._fault(f"{name} raised {_said(error)}") from None
+        space = self.inner.action_space
+        if space is not self.inner_action_space and space != self.inner_action_space:
+            raise self._fault(
+                f"its action space changed from {_short(self.inner_action_space)} to {_short(space)}, which must stay"
+            )
+        return result
+
+    def _scaled(self, action: np.ndarray) -> np.ndarray:
+        """From [-1, 1] to the bounds of the environment."""
+        space = self.inner_action_space
+        unit = np.clip(np.asarray(action, np.float64).reshape(space.shape), -1.0, 1.0) / 2 + 0.5
+        scaled = space.low + unit * (space.high.astype(np.float64) - space.low)
+        return np.clip(scaled.astype(space.dtype), space.low, space.high)  # rounding may overstep
+
+    def _seen(self, obs: Any) -> np.ndarray:
+        """The entries that the agent observes, float32."""
+        space = self.inner_observation_space
+        if isinstance(space, spaces.Box):
+            value = _array(obs)
+            if value.dtype.kind not in "biuf":
+                raise self._fault(f"the observation is of type {value.dtype}, where its space says {space.dtype}")
+            if value.shape != space.shape:
+                raise self._fault(f"the observation has shape {value.shape}, where its space says {space.shape}")
+        else:
+            try:
+                value = np.asarray(spaces.flatten(space, obs))
+            except Exception:
+                raise self._fault(f"the observation does not fit its space {_short(space)}") from None
+            if value.shape != (flat_size(space, self.task.name),):
+                raise self._fault(f"the observation does not fit its space {_short(space)}")
+        with np.errstate(over="ignore"):
+            flat = value.reshape(-1)[self.indices].astype(np.float32)
+        if not np.isfinite(flat).all():
+            entry = int(self.indices[~np.isfinite(flat)][0])
+            raise self._fault(f"entry {entry} of the observation is {value.reshape(-1)[entry]}")
+        return flat
+
+    def _number(self, reward: Any) -> float:
+        value = _array(reward)
+        if value.shape != () or value.dtype.kind not in "biuf":
+            shown = f"of shape {value.shape}" if value.shape else repr(reward)
+            raise self._fault(f"the reward is {shown}, where it must be one number")
+        with np.errstate(over="ignore"):
+            if not np.isfinite(value.astype(np.float32)):
+                raise self._fault(f"the reward is {value}")
+        return float(value)
+
+    def _flag(self, value: Any, name: str) -> bool:
+        if not isinstance(value, bool | np.bool_ | int | np.integer) or value not in (0, 1):
+            raise self._fault(f"{name} is {_short(value)}, where it must be True or False")
+        return bool(value)
+
+
+def flat_size(space: Any, name: str) -> int:
+    """Numbers in an observation of that space when flat.
+
+    Raises:
+        UserError: images, or what does not flatten to a fixed number of them.
+    """
+    if isinstance(space, spaces.Box) and len(space.shape) >= 2 and (space.dtype == np.uint8 or len(space.shape) > 2):
+        raise UserError(
+            f"{name} observes images ({_short(space)}): what is supported are vectors of numbers, such as a robot's "
+            "sensors."
+        )
+    try:
+        if not space.is_np_flattenable:
+            raise ValueError
+        size = spaces.flatdim(space)
+    except (AttributeError, NotImplementedError, ValueError):
+        raise UserError(
+            f"{name} has the observations {_short(space)}: what is supported is a Box, or what flattens to one "
+            "(Discrete, MultiBinary, Dict, Tuple of these)."
+        ) from None
+    if size == 0:
+        raise UserError(f"{name} has an observation without numbers ({_short(space)}): there must be at least one.")
+    return size
+
+
+def success_of(info: Any) -> bool:
+    """Whether the step's info tells of success, under either of the names in use."""
+    return isinstance(info, dict) and bool(np.any(info.get("is_success", info.get("success", False))))
+
+
+def _array(value: Any) -> np.ndarray:
+    try:
+        return np.asarray(value)
+    except ValueError:  # rows of different lengths
+        return np.empty(0, object)
+
+
+def _said(error: BaseException) -> str:
+    """An exception on one line."""
+    text = " ".join(str(error).split())[:300].rstrip(".")
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+def _short(value: Any) -> str:
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 80 else f"{text[:77]}..."

@@ -1,0 +1,148 @@
+"""Environments by their Gymnasium names, the robots of the paper among them, and which entries are velocities.
+
+Robots: pybullet_envs_gymnasium's, the descendants of the paper's Roboschool (Appendix B, Table 4), whose observations
+they share: 8 numbers of the body, then angle and speed of every joint, then the feet's contacts. MuJoCo's and the
+classic ones are Gymnasium's own.
+"""
+
+import contextlib
+import importlib
+import os
+import sys
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import gymnasium
+from gymnasium import error
+
+from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.types import UserError
+
+PREFIX = "gym:"
+
+
+class Known(NamedTuple):
+    """An environment whose observation has names for its parts."""
+
+    id: str
+    about: str
+    velocities: tuple[int, ...]
+    positions: tuple[int, ...]  # all that are no velocities
+    extra: str | None = None  # of this package, that it needs
+
+
+def _known(id: str, about: str, size: int, velocities: tuple[int, ...], extra: str | None = None) -> Known:
+    return Known(id, about, velocities, tuple(i for i in range(size) if i not in velocities), extra)
+
+
+def _bullet(robot: str, joints: int, feet: int) -> Known:
+    velocities = (3, 4, 5, *range(9, 8 + 2 * joints, 2))
+    about = f"PyBullet's {robot}: run forward."
+    id = f"pybullet_envs_gymnasium:{robot}BulletEnv-v0"
+    return _known(id, about, 8 + 2 * joints + feet, velocities, "robots")
+
+
+def _mujoco(id: str, size: int, velocities: tuple[int, ...]) -> Known:
+    return _known(id, f"MuJoCo's {id.split('-')[0]}.", size, velocities, "mujoco")
+
+
+ROBOTS: dict[str, Known] = {
+    "hopper": _bullet("Hopper", joints=3, feet=1),
+    "walker2d": _bullet("Walker2D", joints=6, feet=2),
+    "ant": _bullet("Ant", joints=8, feet=4),
+    "halfcheetah": _bullet("HalfCheetah", joints=6, feet=6),
+}
+
+GYMNASIUMS: tuple[Known, ...] = (
+    _known("Pendulum-v1", "Gymnasium's pendulum.", 3, (2,)),
+    _known("MountainCarContinuous-v0", "A car too weak for its hill.", 2, (1,)),
+    _mujoco("InvertedPendulum-v5", 4, (2, 3)),
+    _mujoco("InvertedDoublePendulum-v5", 9, (5, 6, 7)),
+    _mujoco("Swimmer-v5", 8, tuple(range(3, 8))),
+    _mujoco("Hopper-v5", 11, tuple(range(5, 11))),
+    _mujoco("HalfCheetah-v5", 17, tuple(range(8, 17))),
+    _mujoco("Walker2d-v5", 17, tuple(range(8, 17))),
+    _mujoco("Ant-v5", 105, tuple(range(13, 27))),
+)
+
+KNOWN: dict[str, Known] = {known.id: known for known in (*ROBOTS.values(), *GYMNASIUMS)}
+
+
+def make(id: str, arguments: dict[str, Any], name: str | None = None) -> GymnasiumTask:
+    """The task of a Gymnasium id, `Id` or `package:Id`, which imports the package that registers it.
+
+    `arguments` are gymnasium.make's: max_episode_steps, and those of the environment itself.
+
+    Raises:
+        UserError: there is no such environment, a package is missing, or an argument is impossible.
+    """
+    name = name or PREFIX + id
+    package, _, _ = id.rpartition(":")
+    if package:
+        _import(package, id)
+
+    def make(**arguments: Any) -> gymnasium.Env[Any, Any]:
+        with _quiet() if package else contextlib.nullcontext():
+            if package:
+                importlib.import_module(package)  # in a process of its own it has not been yet
+            return gymnasium.make(id.rpartition(":")[2], disable_env_checker=True, **arguments)
+
+    try:
+        gymnasium.spec(id.rpartition(":")[2])
+    except error.Error as found:
+        raise UserError(
+            f"Gymnasium has no environment {id!r} ({_first_sentence(found)}): an environment of another package is "
+            "named gym:PACKAGE:ID."
+        ) from None
+    limit = arguments.get("max_episode_steps")
+    if limit is not None and not (isinstance(limit, int) and limit >= 1):
+        raise UserError(f"max_episode_steps={limit} is impossible: it must be a whole number of at least 1.")
+    return GymnasiumTask(_explained(make, id), name, dict(arguments))
+
+
+def _import(package: str, id: str) -> None:
+    try:
+        with _quiet():
+            importlib.import_module(package)
+    except ModuleNotFoundError as found:
+        raise UserError(_missing(id, found)) from None
+    except Exception as found:  # whatever a stranger's module may raise
+        raise UserError(f"The module {package} cannot be imported: {type(found).__name__}: {found}.") from None
+
+
+def _explained(make: Any, id: str) -> Any:
+    """The same, with a missing package put as a sentence."""
+
+    def explained(**arguments: Any) -> gymnasium.Env[Any, Any]:
+        try:
+            return make(**arguments)
+        except (ImportError, error.DependencyNotInstalled) as found:
+            raise UserError(_missing(id, found)) from None
+
+    return explained
+
+
+def _missing(id: str, found: Exception) -> str:
+    known = KNOWN.get(id)
+    if known and known.extra:
+        return f"{PREFIX}{id} needs packages that are not installed: pip install 'beliefrl[{known.extra}]'."
+    return f"{PREFIX}{id} needs something that is not installed ({_first_sentence(found)}): install it with pip."
+
+
+def _first_sentence(found: Exception) -> str:
+    return " ".join(str(found).split()).split(". ")[0].rstrip(".")
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Nothing on standard output: PyBullet writes there from C whenever an environment is made."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 1)
+        yield
+    finally:
+        sys.stdout.flush()
+        os.dup2(kept, 1)
+        os.close(kept)
