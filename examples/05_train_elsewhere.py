@@ -25,8 +25,9 @@ def main() -> None:
     args = parser.parse_args()
 
     register()  # after it, gymnasium.make knows BeliefRL/...
-    environments = make_vec_env("BeliefRL/PendulumV-v0", n_envs=4, seed=args.seed)
-    agent = RecurrentPPO("MlpLstmPolicy", environments, gamma=0.98, n_steps=200, batch_size=200, seed=args.seed)
+    environments = make_vec_env("BeliefRL/PendulumV-v0", n_envs=8, seed=args.seed)
+    settings = {"learning_rate": 1e-3, "gamma": 0.9, "n_steps": 128, "batch_size": 512}
+    agent = RecurrentPPO("MlpLstmPolicy", environments, **settings, seed=args.seed)
     agent.learn(args.steps)
 
     fresh = gymnasium.make("BeliefRL/PendulumV-v0")

@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from worlds import Counting
 
 from beliefrl import tasks
 from beliefrl.environment import TaskEnvironment, ids, register
 from beliefrl.types import UserError
+from worlds import Counting
 
 register()
 
@@ -66,7 +66,7 @@ def test_its_steps_are_the_tasks_own(name):
     env.reset(seed=0)
     step = jax.jit(task.step)
     for action in actions_for(env, 20):
-        _, obs, reward, terminated = step(env.state, action, jax.random.key(0))  # no task of ours has noise
+        _, obs, reward, terminated = step(env.states[-1], action, jax.random.key(0))  # no task of ours has noise
         seen, paid, ended, truncated, _ = env.step(action)
         np.testing.assert_allclose(seen, obs, rtol=1e-5, atol=1e-5)
         assert (paid, ended, truncated) == (pytest.approx(float(reward), rel=1e-5), terminated, False)
@@ -142,6 +142,7 @@ class Unhashable(Counting):
         (lambda: gymnasium.make("BeliefRL/Pendulum-v0", max_steps=9), "give gymnasium.make max_episode_steps"),
         (lambda: TaskEnvironment("pendulm"), "did you mean pendulum"),
         (lambda: TaskEnvironment("pendulum", "ansi"), "rgb_array, human or None"),
+        (lambda: TaskEnvironment("gym:Pendulum-v1"), "gym:Pendulum-v1 is not written in JAX: use gymnasium.make"),
         (lambda: TaskEnvironment(Counting(), ends=3), "make it with ends"),
         (lambda: TaskEnvironment(Unhashable()), "Unhashable is not hashable: make it a frozen dataclass"),
         (lambda: TaskEnvironment("pendulum").step(np.zeros(1)), "call reset first"),
@@ -178,7 +179,7 @@ def test_a_reached_target_is_ticked():
     env = TaskEnvironment("target-reaching", "rgb_array")
     env.reset(seed=1)
     before = env.render()
-    env._states = [env.state._replace(reached=jnp.array(1))]
+    env._states = [env.states[-1]._replace(reached=jnp.array(1))]
     assert not np.array_equal(env.render(), before)
 
 
@@ -205,6 +206,7 @@ def test_a_window_without_pygame_says_how_to_get_it(monkeypatch):
 def test_stable_baselines_checks_and_trains_on_it():
     checker = pytest.importorskip("stable_baselines3.common.env_checker")
     contrib = pytest.importorskip("sb3_contrib")
+    pytest.importorskip("torch").set_num_threads(1)  # more of them wait for each other where cores are busy
     for identifier in ids():
         checker.check_env(gymnasium.make(identifier))
     agent = contrib.RecurrentPPO("MlpLstmPolicy", "BeliefRL/PendulumV-v0", n_steps=16, batch_size=16)

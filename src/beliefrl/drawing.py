@@ -11,7 +11,8 @@ from PIL import Image, ImageDraw
 
 from beliefrl.types import UserError
 
-Point = Sequence[Any]  # x to the right and y upwards, two numbers of any kind
+Point = Any  # x to the right and y upwards: two numbers in a tuple or an array
+Points = Any  # a sequence of them, or an array (points, 2)
 SMOOTH = 3  # painted so many times larger and averaged: Pillow's own edges are jagged
 
 PAPER, PALE, GREY, INK = "#fbfaf7", "#e4e1d8", "#a9a79e", "#2f3a45"
@@ -27,13 +28,13 @@ class Circle(NamedTuple):
 class Line(NamedTuple):
     """A line through one or more points, round at its ends and bends."""
 
-    points: Sequence[Point]
+    points: Points
     width: float
     colour: str
 
 
 class Polygon(NamedTuple):
-    points: Sequence[Point]
+    points: Points
     colour: str
 
 
@@ -54,7 +55,7 @@ def paint(picture: Picture) -> UInt8[np.ndarray, "height width 3"]:
     image = Image.new("RGB", (int(width) * SMOOTH, int(height) * SMOOTH), PAPER)
     canvas = ImageDraw.Draw(image)
 
-    def place(points: Sequence[Point]) -> list[tuple[float, float]]:
+    def place(points: Points) -> list[tuple[float, float]]:
         at = (np.asarray(points, float) - low) * scale * SMOOTH
         return [(float(x), image.height - float(y)) for x, y in at]
 

@@ -48,7 +48,7 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
     Observations are (obs_dim,) float32, as the task gives them; actions (action_dim,) in [-1, 1], clipped to it.
     `info["is_success"]` tells after each step whether the episode has reached its aim, where `spec.has_success`.
 
-    The time limit is Gymnasium's: `gymnasium.make` sets it to the task's `max_steps`, or to its own `max_episode_steps`.
+    The time limit is Gymnasium's: `gymnasium.make` sets it to the task's `max_steps`, or to `max_episode_steps`.
     For a task of your own: `gymnasium.wrappers.TimeLimit(TaskEnvironment(task), task.spec.max_steps)`.
 
     To be rendered, a task has a method `draw(states) -> drawing.Picture`, given the episode's states, the newest last.
@@ -62,10 +62,11 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         Args:
             task: one of `tasks.names()`, or any `Task` that is hashable, as frozen dataclasses are.
             render_mode: "rgb_array" for `render` to return pictures, "human" for a window, None for neither.
-            constants: replace the physical constants of the task of that name.
+            constants: replace the physical constants of the task of that name, as in `tasks.make`.
 
         Raises:
-            UserError: no task has that name, it has no such constant, or there is no such render mode.
+            UserError: no task has that name, it has no such constant, it is not a task in JAX or not hashable, or
+                there is no such render mode.
         """
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise UserError(f"render_mode={render_mode!r} is impossible: it must be rgb_array, human or None.")
@@ -74,6 +75,8 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         if constants and not isinstance(task, str):
             raise UserError(f"A task that is made already takes no constants: make it with {', '.join(constants)}.")
         self.task = tasks.make(task, **constants) if isinstance(task, str) else task
+        if not isinstance(self.task, Task):
+            raise UserError(f"{task} is not written in JAX: use gymnasium.make for it, or give a task in JAX.")
         try:
             hash(self.task)
         except TypeError:
@@ -83,22 +86,24 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (spec.action_dim,), np.float32)
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (spec.obs_dim,), np.float32)
         # What is hidden from the agent is drawn all the same.
-        self._drawn: Any = self.task.task if isinstance(self.task, Observed) else self.task
+        self._drawn: Any = self.task
+        while isinstance(self._drawn, Observed):
+            self._drawn = self._drawn.task
         if hasattr(self._drawn, "dt"):
-            self.metadata = self.metadata | {"render_fps": round(1 / self._drawn.dt)}
+            self.metadata = self.metadata | {"render_fps": max(1, round(1 / self._drawn.dt))}
         self._states: list[Any] = []
         self._window: Window | None = None
 
     @property
-    def state(self) -> Any:
-        """The task's state at this moment.
+    def states(self) -> list[Any]:
+        """The task's states in this episode, the newest last; only that one where nothing is rendered.
 
         Raises:
-            UserError: there is none before the first reset.
+            UserError: there are none before the first reset.
         """
         if not self._states:
             raise UserError("The environment has no state yet: call reset first.")
-        return self._states[-1]
+        return self._states
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -122,10 +127,9 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         action = np.asarray(action, np.float32)
         if action.shape != self.action_space.shape:
             raise UserError(f"The action has the shape {action.shape}: it must be {self.action_space.shape}.")
-        before = self.state
-        self._key, state, *outcome = _step(self.task, self._key, before, action)
-        # Only a picture needs what was before.
-        self._states = [state] if self.render_mode is None else [*self._states, state]
+        before = self.states
+        self._key, state, *outcome = _step(self.task, self._key, before[-1], action)
+        self._states = [*before, state] if self.render_mode else [state]
         self._show()
         obs, reward, terminated, success = jax.device_get(outcome)
         info = {"is_success": bool(success)} if self.task.spec.has_success else {}
@@ -135,7 +139,7 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         if not hasattr(self._drawn, "draw"):
             name = type(self._drawn).__name__
             raise UserError(f"{name} cannot be rendered: give it a method draw(states) that returns a drawing.Picture.")
-        return self._drawn.draw(self._states)
+        return self._drawn.draw(self.states)
 
     def render(self) -> UInt8[np.ndarray, "height width 3"] | None:
         """The picture of this moment where `render_mode` is "rgb_array"; the window of "human" shows it by itself.
@@ -143,9 +147,7 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         Raises:
             UserError: the task has no method `draw`, or there is no state before the first reset.
         """
-        if self.render_mode != "rgb_array" or self.state is None:
-            return None
-        return paint(self._picture())
+        return paint(self._picture()) if self.render_mode == "rgb_array" else None
 
     def _show(self) -> None:
         if self.render_mode == "human":

@@ -50,16 +50,17 @@ def restore(run: Run, task: Task | GymnasiumTask | None = None) -> tuple[Agent, 
     """
     config = run.config
     agent = agents.make(config["agent"], **_tuples(config["hyperparameters"]))
+    made: Any = task
     if task is None:
         if not tasks.knows(config["task"]):
             raise UserError(
                 f"{run.folder} was trained on {config['task']}, which is not a task of this library: pass task=."
             )
-        task = tasks.make(config["task"], config.get("observe"), **_tuples(config["constants"]))
-    spec = task.spec
+        made = tasks.make(config["task"], config.get("observe"), **_tuples(config["constants"]))
+    spec = made.spec
     keys = jax.random.split(jax.random.key(0), len(run.seeds))
     like = jax.eval_shape(jax.vmap(lambda key: agent.init(key, spec)), keys)
-    return agent, task, run.load(like)
+    return agent, made, run.load(like)
 
 
 def _tuples(values: dict[str, Any]) -> dict[str, Any]:
@@ -90,13 +91,13 @@ def evaluate(
     if not 0 <= seed <= LARGEST:
         raise UserError(f"seed={seed} is impossible: it must be from 0 to {LARGEST}.")
     run = run if isinstance(run, Run) else Run(run)
-    agent, task, states = restore(run, task)
+    agent, found, states = restore(run, task)
     keys = jax.random.split(jax.random.key(seed), len(run.seeds))
-    if isinstance(task, GymnasiumTask):
-        result = _on_host(agent, task, states, keys, episodes, run.seeds)
+    if isinstance(found, GymnasiumTask):
+        result = _on_host(agent, found, states, keys, episodes, run.seeds)
     else:
-        result = jax.jit(jax.vmap(lambda state, key: evaluate_seed(agent, task, state, key, episodes)))(states, keys)
-    return {"episodes": episodes} | summary(result, task.spec.has_success)
+        result = jax.jit(jax.vmap(lambda state, key: evaluate_seed(agent, found, state, key, episodes)))(states, keys)
+    return {"episodes": episodes} | summary(result, found.spec.has_success)
 
 
 def _on_host(

@@ -127,8 +127,8 @@ class _Told:
         """Means over its updates; episodes with leaves (seed, step)."""
         metrics, columns = jax.device_get((self.metrics, list(zip(*self.episodes, strict=True))))
         means = {name: np.mean([each[name] for each in metrics], axis=0) for name in (metrics[0] if metrics else {})}
-        none = np.zeros((1, 0))
-        return Stretch(means, Episode(*(np.stack(column, axis=1) for column in columns or [[none[0]]] * 4)))
+        episodes: Any = [np.stack(column, axis=1) for column in columns]
+        return Stretch(means, Episode(*episodes) if columns else None)
 
 
 def environment_seeds(keys: Key[Array, "*lane"]) -> Int[np.ndarray, "*lane"]:
@@ -186,8 +186,9 @@ class Evaluation:
         keys = jax.vmap(lambda key: jax.random.split(key, 2))(keys)
         obs = self.environments.reset(environment_seeds(keys).reshape(-1))
         lanes = len(obs)
-        action, none = np.zeros((lanes, self.task.spec.action_dim), np.float32), np.zeros(lanes, np.float32)
-        step = Step(obs, none, action, np.ones(lanes, bool), np.zeros(lanes, bool))
+        action: Any = np.zeros((lanes, self.task.spec.action_dim), np.float32)
+        never: Any = np.zeros(lanes, bool)
+        step = Step(obs, never.astype(np.float32), action, ~never, never)
         memory = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*keys.shape, *leaf.shape)), self._empty())
         record, total, length = _Record(lanes, episodes), np.zeros(lanes), np.zeros(lanes, int)
         explore, time = np.array([True, False]), 0
@@ -201,7 +202,7 @@ class Evaluation:
             if done.any():
                 obs = self.environments.restart(done)
                 total, length = np.where(done, 0.0, total), np.where(done, 0, length)
-            step = Step(obs, np.where(done, 0, reward), np.where(done[:, None], 0, action), done, step.terminated)
+            step = Step(obs, reward * ~done, action * ~done[:, None], done, never)
         return jax.tree.map(lambda leaf: leaf.reshape(*keys.shape, episodes), record.episodes)
 
     def close(self) -> None:
@@ -233,8 +234,8 @@ class _Record:
 
     def __init__(self, lanes: int, episodes: int):
         shape = (lanes, episodes)
-        kinds = (bool, np.float32, np.int32, bool)
-        self.episodes = Episode(*(np.zeros(shape, kind) for kind in kinds))
+        columns: Any = [np.zeros(shape, kind) for kind in (bool, np.float32, np.int32, bool)]
+        self.episodes = Episode(*columns)
         self.count = np.zeros(lanes, int)
 
     @property

@@ -8,6 +8,7 @@ import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import logger
@@ -19,6 +20,16 @@ from beliefrl.types import UserError
 
 HANDOVER = 5e-4  # seconds that giving a step to other processes costs, about
 PROCESSES = ("auto", "always", "never")
+
+
+class Answers(NamedTuple):
+    """What the environments answer, numpy arrays."""
+
+    obs: Any  # (lane, obs) float32
+    reward: Any  # (lane,) float32
+    terminated: Any  # (lane,) bool
+    truncated: Any  # (lane,) bool
+    success: Any  # (lane,) bool
 
 
 class Lockstep:
@@ -37,6 +48,7 @@ class Lockstep:
         """
         self.task, self.lanes = task, lanes
         self.steps = 0
+        self._envs: Any = None
         factories = [_Factory(task, lane) for lane in lanes]
         self.apart = processes == "always" or (processes == "auto" and _pays(task, len(lanes)))
         with self._faults():
@@ -46,48 +58,48 @@ class Lockstep:
             else:
                 self._envs = SyncVectorEnv(factories, autoreset_mode=AutoresetMode.DISABLED)
 
-    def reset(self, seeds: Int[np.ndarray, " lane"]) -> Float[np.ndarray, "lane obs"]:
-        """Begin an episode everywhere."""
+    def reset(self, seeds: Int[np.ndarray, " lane"]) -> Any:
+        """Begin an episode everywhere; returns what is observed, (lane, obs)."""
         with self._faults():
             return self._envs.reset(seed=[int(seed) for seed in seeds])[0]
 
-    def step(
-        self, actions: Float[np.ndarray, "lane action"]
-    ) -> tuple[
-        Float[np.ndarray, "lane obs"],
-        Float[np.ndarray, " lane"],
-        Bool[np.ndarray, " lane"],
-        Bool[np.ndarray, " lane"],
-        Bool[np.ndarray, " lane"],
-    ]:
-        """Act everywhere; returns observations, rewards, terminated, truncated, success."""
+    def step(self, actions: Float[np.ndarray, "lane action"]) -> "Answers":
+        """Act everywhere."""
         self.steps += 1
         with self._faults():
             obs, reward, terminated, truncated, info = self._envs.step(actions)
-        return obs, reward.astype(np.float32), terminated, truncated, np.asarray(info["success"], bool)
+        return Answers(obs, reward.astype(np.float32), terminated, truncated, np.asarray(info["success"], bool))
 
-    def restart(self, done: Bool[np.ndarray, " lane"]) -> Float[np.ndarray, "lane obs"]:
-        """Begin an episode where one is done; returns what is observed everywhere."""
+    def restart(self, done: Bool[np.ndarray, " lane"]) -> Any:
+        """Begin an episode where one is done; returns what is observed everywhere, (lane, obs)."""
         with self._faults():
             return self._envs.reset(options={"reset_mask": done})[0]
 
     def close(self) -> None:
         """Close them all; what goes wrong in that concerns nobody any more."""
-        with contextlib.suppress(Exception), _silence():
-            self._envs.close(**({"terminate": True} if self.apart else {}))
+        if self.apart and not self._idle:  # they would be asked to finish their step first
+            for process in self._envs.processes:
+                process.terminate()
+                process.join()
+            self._envs.closed = True
+        with contextlib.suppress(Exception):
+            self._envs.close()
 
     @contextlib.contextmanager
     def _faults(self) -> Iterator[None]:
         """A lane's process that has died is a Fault."""
+        self._idle = False
         try:
             with _silence():
                 yield
+            self._idle = True
         except (EOFError, ConnectionError, BrokenPipeError):
             raise Fault(self._death()) from None
 
     def _death(self) -> str:
         dead = []
-        for lane, process in zip(self.lanes, self._envs.processes, strict=True) if hasattr(self, "_envs") else ():
+        processes = getattr(self._envs, "processes", ())
+        for lane, process in zip(self.lanes, processes, strict=bool(processes)):
             process.join(timeout=0.5)
             if not process.is_alive():
                 dead.append(f"{lane} (exit code {process.exitcode})")
@@ -131,7 +143,7 @@ def step_seconds(task: GymnasiumTask, steps: int = 20) -> float:
     try:
         environment = task.environment()
         environment.reset(seed=0)
-        actions = np.random.default_rng(0).uniform(-1, 1, (steps, *environment.action_space.shape))
+        actions = np.random.default_rng(0).uniform(-1, 1, (steps, task.spec.action_dim))
         times = []
         for action in actions:
             before = time.perf_counter()

@@ -47,7 +47,7 @@ class Stretch(NamedTuple):
     """What a stretch of steps tells, of one seed."""
 
     metrics: Metrics  # means over its updates
-    episodes: Episode  # leaves (stretch,): one entry a step, done only where an episode ended
+    episodes: Episode | None  # leaves (stretch,): one entry a step, done only where an episode ended
 
 
 def begin(agent: Agent, task: Task, capacity: int, key: Key[Array, ""]) -> Seed:

@@ -140,7 +140,9 @@ class Policy:
             raise UserError(f"{path} cannot be written ({error.strerror}): choose another file.") from None
 
 
-def load(run: Run | str | os.PathLike[str], seed: int | None = None, task: Task | GymnasiumTask | None = None) -> Policy:
+def load(
+    run: Run | str | os.PathLike[str], seed: int | None = None, task: Task | GymnasiumTask | None = None
+) -> Policy:
     """The policy that a run has learned.
 
     Args:
@@ -155,6 +157,6 @@ def load(run: Run | str | os.PathLike[str], seed: int | None = None, task: Task 
     seed = run.seeds[0] if seed is None else seed
     if seed not in run.seeds:
         raise UserError(f"{run.folder} has no seed {seed}: it has {', '.join(map(str, run.seeds))}.")
-    agent, task, states = restore(run, task)
+    agent, found, states = restore(run, task)
     index = run.seeds.index(seed)
-    return Policy(agent, task.spec, jax.tree.map(lambda leaf: leaf[index], states), seed)
+    return Policy(agent, found.spec, jax.tree.map(lambda leaf: leaf[index], states), seed)

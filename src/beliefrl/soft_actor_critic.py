@@ -12,7 +12,7 @@ log α in place of α in J_α, which is the same descent at another speed. A tim
 the differentiated argument comes first, and means are over valid transitions.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -23,6 +23,9 @@ from jaxtyping import Array, Bool, Float, Key
 from beliefrl.nets import MLP, descend, draw, tanh_gaussian
 
 LOG_SIGMA_MIN, LOG_SIGMA_MAX = -20.0, 2.0
+
+
+Network = TypeVar("Network")
 
 
 class Actor(eqx.Module):
@@ -171,8 +174,8 @@ def loss(
     return j_pi + j_v + j_q + j_alpha, metrics
 
 
-def soft_update(target: MLP, value: MLP, tau: float) -> MLP:
-    """V̄ moves by the fraction τ towards V."""
+def soft_update(target: Network, value: Network, tau: float) -> Network:
+    """A target network, such as V̄, moves by the fraction τ towards the one that learns."""
     return jax.tree.map(lambda old, new: old + tau * (new - old), target, value)
 
 

@@ -16,12 +16,12 @@ from beliefrl import agents, host_loop, phases, runs, tasks
 from beliefrl.agents import Agent
 from beliefrl.analysis.curves import draw_curve
 from beliefrl.evaluation import MODES, MOST_EPISODES, summary
+from beliefrl.lockstep import PROCESSES
 from beliefrl.phases import Metrics, Program
 from beliefrl.rollout import Episode
 from beliefrl.runs import Recorder, Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
-from beliefrl.lockstep import PROCESSES
 from beliefrl.types import UserError, check_choice, check_range
 
 
@@ -42,8 +42,8 @@ class Options:
     replay_capacity: int = 1_000_000
     """Most moments that a seed's replay keeps; the oldest make room."""
     processes: str = "auto"
-    """Gymnasium environments: a process for each ("always"), none ("never"), or where that pays ("auto"; a Python script
-    that means "always" must begin under `if __name__ == "__main__":`)."""
+    """Gymnasium environments: a process for each (always), for none (never), or where that pays (auto, from the command
+    line). A Python script that says always must begin under `if __name__ == "__main__":`."""
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
@@ -178,25 +178,25 @@ def train(
             none may do; then what was learned and logged until that step is saved.
     """
     agent = agents.make(agent) if isinstance(agent, str) else agent
-    task = tasks.make(task) if isinstance(task, str) else task
+    made: Any = tasks.make(task) if isinstance(task, str) else task
     known = [field.name for field in dataclasses.fields(Options)]
     for name in options:
         if name not in known:
             raise UserError(f"Training has no option {name!r}: it has {', '.join(known)}.")
     chosen = Options(**options)
     _capacity(agent, chosen)  # complains before there is a folder, as the next line does
-    spec = task.spec
+    spec = made.spec
     config = {
         "agent": agents.name_of(agent),
         "hyperparameters": dataclasses.asdict(agent),  # pyright: ignore[reportArgumentType]
-        **tasks.describe(task),
+        **tasks.describe(made),
         "options": dataclasses.asdict(chosen),
         **runs.provenance(),
     }
     recorder = Recorder(out or runs.free_folder(f"{config['agent']}-{config['task']}"), config)
     results = None
     try:
-        for event in stages(agent, task, chosen):
+        for event in stages(agent, made, chosen):
             results = _record(recorder, event, spec.has_success) or results
             if report is not None:
                 report(event)

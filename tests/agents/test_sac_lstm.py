@@ -72,7 +72,7 @@ def test_acting_forms_the_belief_that_replay_forms(state):
 
 def batch_of(agent, lstm, window):
     d = agent.beliefs(lstm, window)
-    return agent.batch(window, d, d)
+    return agent.batch(window, d, d, d)
 
 
 def test_batches_are_aligned_in_time(state):
@@ -119,10 +119,24 @@ def test_gradients_of_three_losses_reach_the_lstm_and_none_through_targets(state
     direction = random_like(state.lstm, jax.random.key(3))
     functions = [jax.jit(function) for function in frozen_losses(agent, state, window, key)]
     by_pi, by_v, by_q = (slope(function, state.lstm, direction, by=2e-3) for function in functions)
-    by_critics, by_actor, _ = jax.jit(agent.gradients)(state.lstm, state.controller, window, key)[0]
+    by_critics, by_actor, _ = jax.jit(agent.gradients)(state.lstm, state.lstm, state.controller, window, key)[0]
     assert min(abs(by_pi), abs(by_v), abs(by_q)) > 1e-3
     assert along(by_critics, direction) == pytest.approx(by_v + by_q, rel=0.02)
     assert along(by_actor, direction) == pytest.approx(by_pi, rel=0.02)
+
+
+def test_the_target_lstm_is_what_the_target_value_reads(state):
+    window, key = windows(jax.random.key(1), 2, TIME), jax.random.key(2)
+    other = jax.tree.map(lambda leaf: leaf + 0.1, state.lstm)
+    d = AGENT.beliefs(state.lstm, window)
+    batch = AGENT.batch(window, d, d, AGENT.beliefs(other, window))
+    np.testing.assert_array_equal(batch.belief, batch_of(AGENT, state.lstm, window).belief)
+    np.testing.assert_array_equal(batch.next_belief, batch_of(AGENT, other, window).next_belief)
+    gradients = jax.jit(AGENT.gradients)
+    (by_critics, by_actor, _), _ = gradients(state.lstm, state.lstm, state.controller, window, key)
+    (by_critics_now, by_actor_now, _), _ = gradients(state.lstm, other, state.controller, window, key)
+    assert differ(by_critics, by_critics_now)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-8), by_actor, by_actor_now)
 
 
 def test_no_gradient_goes_into_the_burn_in(state):
@@ -130,16 +144,18 @@ def test_no_gradient_goes_into_the_burn_in(state):
     window, key = windows(jax.random.key(1), 2, TIME), jax.random.key(2)
     obs = window.step.obs.at[:, AGENT.burn_in :, 0].set(0.0)
     window = window._replace(step=window.step._replace(obs=obs))
-    by_critics, by_actor, _ = jax.jit(AGENT.gradients)(state.lstm, state.controller, window, key)[0]
+    by_critics, by_actor, _ = jax.jit(AGENT.gradients)(state.lstm, state.lstm, state.controller, window, key)[0]
     for gradient in (by_critics, by_actor):
         np.testing.assert_array_equal(gradient.by_x[0], 0.0)
         assert np.all(gradient.by_x[1] != 0.0)
 
 
-def test_an_update_trains_everything_but_the_target(state):
+def test_an_update_trains_everything_and_the_targets_follow_slowly(state):
     window = windows(jax.random.key(1), 2, TIME)
     after, _ = jax.jit(AGENT.pretrain)(state, window, jax.random.key(2))
     assert differ(after.lstm, state.lstm)
+    expected = jax.tree.map(lambda old, new: old + AGENT.tau * (new - old), state.target_lstm, after.lstm)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-7), after.target_lstm, expected)
     assert differ(after.controller._replace(target_value=0), state.controller._replace(target_value=1))
 
 

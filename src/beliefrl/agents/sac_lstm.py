@@ -3,6 +3,9 @@
 Source: Section 5, Table 1, Appendix A.2.2 and A.1.2. The belief is d_t = LSTM(d_{t-1}; o_t). Sequences, burn-in and
 resets inside windows are those of VRM; the gradients of J_π (through μ and log σ), J_V and J_Q reach the LSTM, those
 through the targets and through the Q of the actor's loss do not.
+
+Departure: V̄ reads the state of a target LSTM, which moves as V̄ does. With the state of the LSTM that learns, as in the
+authors' code, the target moves with every update, and what was learned is lost again (docs/agents/sac-lstm.md).
 """
 
 import dataclasses
@@ -15,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents.sac import SAC, Metrics, split_updates
 from beliefrl.nets import LSTM, LSTMState, descend, draw
-from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState, update
+from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState, soft_update, update
 from beliefrl.types import Spec, Step, Window, WindowShape, check_range, time_major, transitions
 
 
@@ -23,6 +26,7 @@ class State(NamedTuple):
     """Everything that training changes."""
 
     lstm: LSTM
+    target_lstm: LSTM
     controller: Controller
     lstm_optimisers: tuple[optax.OptState, optax.OptState]  # for the critics' gradient and for the actor's
     controller_optimiser: OptimiserState
@@ -84,7 +88,7 @@ class SACLSTMAgent(SAC):
         lstm = draw(key_lstm, LSTM(x, self.d_size))
         controller, controller_optimiser = self.init_controller(key_controller, self.d_size, spec.action_dim)
         lstm_optimiser = self.lstm_optimiser.init(lstm)  # pyright: ignore[reportArgumentType]
-        return State(lstm, controller, (lstm_optimiser, lstm_optimiser), controller_optimiser)
+        return State(lstm, lstm, controller, (lstm_optimiser, lstm_optimiser), controller_optimiser)
 
     # Acting
 
@@ -130,12 +134,18 @@ class SACLSTMAgent(SAC):
             start = jax.tree.map(lambda leaf: leaf[-1], burnt_in)
         return lstm.unroll(start, self.perception(after.step), after.step.is_first).d
 
-    def batch(self, windows: Window, d: Float[Array, "time batch d"], d_actor: Float[Array, "time batch d"]) -> Batch:
-        """The windows' transitions, with beliefs for the critics and for the actor (the same numbers)."""
+    def batch(
+        self,
+        windows: Window,
+        d: Float[Array, "time batch d"],
+        d_actor: Float[Array, "time batch d"],
+        d_target: Float[Array, "time batch d"],
+    ) -> Batch:
+        """The windows' transitions, with beliefs for the critics, for the actor (the same numbers) and for V̄."""
         step = time_major(windows, self.burn_in, None).step
         batch = Batch(
             belief=d[:-1],
-            next_belief=d[1:],
+            next_belief=d_target[1:],
             action=step.prev_action[1:],
             reward=step.reward[1:],
             terminated=step.terminated[1:],
@@ -145,24 +155,27 @@ class SACLSTMAgent(SAC):
         return jax.tree.map(lambda leaf: leaf[0], split_updates(batch, self.batch_size))
 
     def gradients(
-        self, lstm: LSTM, controller: Controller, windows: Window, key: Key[Array, ""]
+        self, lstm: LSTM, target_lstm: LSTM, controller: Controller, windows: Window, key: Key[Array, ""]
     ) -> tuple[tuple[LSTM, LSTM, Controller], Metrics]:
         """Of J_V + J_Q in the LSTM, of J_π in the LSTM, and of all losses in the controller."""
 
         def loss(d: Array, d_actor: Array, controller: Controller) -> tuple[Float[Array, ""], Metrics]:
-            return self.controller_loss(controller, self.batch(windows, d, d_actor), key)
+            return self.controller_loss(controller, self.batch(windows, d, d_actor, d_target), key)
 
+        d_target = self.beliefs(target_lstm, windows)
         d, pullback = jax.vjp(lambda lstm: self.beliefs(lstm, windows), lstm)
         (by_d, by_d_actor, by_controller), metrics = jax.grad(loss, (0, 1, 2), has_aux=True)(d, d, controller)
         return (*pullback(by_d), *pullback(by_d_actor), by_controller), metrics
 
     def update(self, state: State, batch: Window, key: Key[Array, ""]) -> tuple[State, Metrics]:
         """One update of the LSTM and the controller; the batch is windows."""
-        (by_critics, by_actor, by_controller), metrics = self.gradients(state.lstm, state.controller, batch, key)
+        gradients, metrics = self.gradients(state.lstm, state.target_lstm, state.controller, batch, key)
+        by_critics, by_actor, by_controller = gradients
         s_critics, s_actor = state.lstm_optimisers
         lstm, s_critics = descend(self.lstm_optimiser, by_critics, s_critics, state.lstm)
         lstm, s_actor = descend(self.lstm_optimiser, by_actor, s_actor, lstm)
         controller, controller_optimiser = update(
             self.optimisers, state.controller_optimiser, state.controller, by_controller, self.tau
         )
-        return State(lstm, controller, (s_critics, s_actor), controller_optimiser), metrics
+        target_lstm = soft_update(state.target_lstm, lstm, self.tau)
+        return State(lstm, target_lstm, controller, (s_critics, s_actor), controller_optimiser), metrics

@@ -57,8 +57,8 @@ class GymnasiumTask:
         """
         environment = self.environment()
         environment.close()
-        (obs,), (action,) = environment.observation_space.shape, environment.action_space.shape
-        return Spec(obs, action, environment.limit or LARGEST, self.has_success)
+        actions = environment.inner_action_space
+        return Spec(environment.indices.size, actions.low.size, environment.limit or LARGEST, self.has_success)
 
     def environment(self, seed: str = "") -> "Environment":
         """One of its environments as the agent sees it; `seed` is what faults say of whose it is.
@@ -85,9 +85,10 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
             raise
         except Exception as error:  # whatever a stranger's environment may raise
             raise UserError(f"{task.name} cannot be made: {_said(error)}.") from None
-        self.inner_action_space, self.inner_observation_space = self.inner.action_space, self.inner.observation_space
-        size = flat_size(self.inner_observation_space, task.name)
+        self.inner_action_space: Any = getattr(self.inner, "action_space", None)
+        self.inner_observation_space: Any = getattr(self.inner, "observation_space", None)
         self._check_actions(self.inner_action_space)
+        size = flat_size(self.inner_observation_space, task.name)
         self.indices = np.arange(size) if task.indices is None else np.array(task.indices)
         if self.indices.size == 0 or not np.all((self.indices >= 0) & (self.indices < size)):
             raise UserError(
@@ -95,9 +96,9 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
                 f"give indices from 0 to {size - 1}."
             )
         self.observation_space = spaces.Box(-np.inf, np.inf, (self.indices.size,), np.float32)
-        self.action_space = spaces.Box(-1.0, 1.0, (int(np.prod(self.inner_action_space.shape)),), np.float32)
-        own = self.inner.spec.max_episode_steps if self.inner.spec else None
-        self.limit = task.max_steps or own
+        self.action_space = spaces.Box(-1.0, 1.0, (self.inner_action_space.low.size,), np.float32)
+        registered = getattr(self.inner, "spec", None)
+        self.limit = task.max_steps or (registered.max_episode_steps if registered else None)
 
     def _check_actions(self, space: Any) -> None:
         name = self.task.name

@@ -8,6 +8,7 @@ classic ones are Gymnasium's own.
 import contextlib
 import importlib
 import os
+import pathlib
 import sys
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -139,7 +140,7 @@ def _quiet() -> Iterator[None]:
     sys.stdout.flush()
     kept = os.dup(1)
     try:
-        with open(os.devnull, "wb") as nowhere:
+        with pathlib.Path(os.devnull).open("wb") as nowhere:
             os.dup2(nowhere.fileno(), 1)
         yield
     finally:

@@ -1,0 +1,198 @@
+"""Gymnasium environments as tasks: what the agent sees and does, what is supported, and every fault a sentence."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from beliefrl import tasks
+from beliefrl.lockstep import Lockstep
+from beliefrl.tasks import gymnasium as adapter
+from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
+from beliefrl.types import UserError
+from wrong import BOX, FAULTS, UNSUPPORTED, Dictionary, Fine
+
+
+def a_sentence(error):
+    text = str(error.value)
+    assert text.endswith(".")
+    assert "\n" not in text
+    assert "Traceback" not in text
+    return text
+
+
+@pytest.mark.parametrize("make", UNSUPPORTED, ids=lambda make: UNSUPPORTED[make])
+def test_what_is_not_supported_is_refused_before_anything_begins(make):
+    with pytest.raises(UserError) as error:
+        _ = GymnasiumTask(make, "robot").spec
+    text = a_sentence(error)
+    assert text.startswith("robot ")
+    assert UNSUPPORTED[make] in text
+
+
+@pytest.mark.parametrize("make", FAULTS, ids=lambda make: FAULTS[make][0])
+def test_a_fault_names_the_environment_the_seed_and_the_step(make, monkeypatch):
+    monkeypatch.setattr(adapter, "ENDLESS", 25)
+    phrase, step = FAULTS[make]
+    lanes = Lockstep(GymnasiumTask(make, "robot"), ["seed 4"])
+    with pytest.raises(Fault) as error:  # noqa: PT012 - it may come at any of them
+        lanes.reset(np.array([0]))
+        for _ in range(30):
+            lanes.step(np.zeros((1, 1), np.float32))
+    text = a_sentence(error)
+    assert text.startswith(f"robot (seed 4, step {step}): ")
+    assert phrase in text
+    lanes.close()
+
+
+def test_there_are_at_least_thirty_bad_environments():
+    assert len(FAULTS) + len(UNSUPPORTED) > 30
+    assert len(FAULTS) > 30
+
+
+def test_actions_are_scaled_to_the_range_of_the_environment():
+    environment = GymnasiumTask(Fine).environment()
+    environment.reset(seed=0)
+    for action, expected in ((-1.0, -2.0), (0.0, 2.0), (1.0, 6.0), (5.0, 6.0), (0.5, 4.0)):
+        environment.step(np.array([action]))
+        np.testing.assert_allclose(environment.inner.action, [expected])
+        assert environment.inner.action.dtype == np.float32
+
+
+def test_an_action_of_any_shape_is_a_row_of_numbers():
+    class Matrix(Fine):
+        action_space = spaces.Box(
+            np.array([[0.0, 0.0], [0.0, -4.0]]), np.array([[1.0, 2.0], [3.0, 4.0]]), dtype=np.float64
+        )
+
+    task = GymnasiumTask(Matrix)
+    assert task.spec.action_dim == 4
+    environment = task.environment()
+    environment.reset(seed=0)
+    environment.step(np.array([-1.0, 1.0, 1.0, 0.0]))
+    np.testing.assert_allclose(environment.inner.action, [[0.0, 2.0], [3.0, 0.0]])
+
+
+def test_composite_observations_are_flat():
+    task = GymnasiumTask(Dictionary)
+    assert task.spec.obs_dim == 5
+    np.testing.assert_array_equal(task.environment().reset(seed=0)[0][-3:], [0.0, 1.0, 0.0])
+
+
+def test_only_the_entries_observed_are_seen_in_their_order():
+    whole = tasks.make("gym:Pendulum-v1").environment().reset(seed=3)[0]
+    part = tasks.make("gym:Pendulum-v1", observe=[2, 0]).environment().reset(seed=3)[0]
+    np.testing.assert_array_equal(part, whole[[2, 0]])
+    again = tasks.observe(tasks.make("gym:Pendulum-v1", observe=[2, 0]), (1,))
+    np.testing.assert_array_equal(again.environment().reset(seed=3)[0], whole[[0]])
+
+
+def test_an_entry_that_is_not_seen_may_be_anything():
+    class Broken(Fine):
+        def observe(self):
+            return np.array([np.nan, 0.5])
+
+    np.testing.assert_allclose(GymnasiumTask(Broken, indices=(1,)).environment().reset(seed=0)[0], [0.5])
+
+
+def test_a_time_limit_truncates_and_does_not_terminate():
+    environment = GymnasiumTask(Fine, max_steps=4).environment()
+    environment.reset(seed=0)
+    ends = [environment.step(np.zeros(1))[2:4] for _ in range(4)]
+    assert ends == [(False, False)] * 3 + [(False, True)]
+    assert GymnasiumTask(Fine, max_steps=4).spec.max_steps == 4
+    assert tasks.make("gym:Pendulum-v1", max_episode_steps=7).spec.max_steps == 7
+
+
+def test_masks_by_name_are_those_of_the_task():
+    assert tasks.make("gym:MountainCarContinuous-v0", observe="velocities").indices == (1,)
+    assert tasks.make("gym:Pendulum-v1", observe=["positions"]).indices == (0, 1)
+    assert tasks.describe(tasks.make("pendulum", observe="velocities"))["task"] == "pendulum-v"
+    hopper = tasks.registered.ROBOTS["hopper"]
+    assert hopper.velocities == (3, 4, 5, 9, 11, 13)  # the authors' index sets
+    assert hopper.positions == (0, 1, 2, 6, 7, 8, 10, 12, 14)
+    ant = tasks.registered.ROBOTS["ant"]
+    assert ant.velocities == (3, 4, 5, 9, 11, 13, 15, 17, 19, 21, 23)
+    assert ant.positions == (0, 1, 2, 6, 7, 8, 10, 12, 14, 16, 18, 20, 22, 24, 25, 26, 27)
+
+
+@pytest.mark.parametrize(
+    ("name", "given"),
+    [
+        ("gym:MountainCarContinuous-v0", {"observe": [0]}),
+        ("gym:Pendulum-v1", {"g": 9.81, "max_episode_steps": 50}),
+        ("hopper-v", {}),
+        ("walker2d", {"observe": "positions"}),
+        ("pendulum-p", {"observe": [1]}),
+        ("cartpole", {"observe": (0, 3)}),
+        ("pendulum-v", {"mass": 2.0}),
+    ],
+)
+def test_a_task_is_made_again_from_its_description(name, given):
+    if name[:6] in ("hopper", "walker"):
+        pytest.importorskip("pybullet_envs_gymnasium")
+    task = tasks.make(name, **given)
+    said = tasks.describe(task)
+    again = tasks.make(said["task"], said["observe"], **said["constants"])
+    assert tasks.describe(again) == said
+    assert again.spec == task.spec
+    assert getattr(again, "indices", None) == getattr(task, "indices", None)
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "phrase"),
+    [
+        ("gym:Nothing-v0", {}, "Gymnasium has no environment 'Nothing-v0'"),
+        ("gym:", {}, "Gymnasium has no environment ''"),
+        ("gym:no_such_module:Robot-v0", {}, "no_such_module"),
+        ("gym:Pendulum-v1", {"observe": [3]}, "give indices from 0 to 2"),
+        ("gym:Pendulum-v1", {"observe": ["x"]}, "observe=x cannot be understood"),
+        ("gym:CartPole-v1", {"observe": "velocities"}, "does not say which"),
+        ("pendulum-v", {"observe": "velocities"}, "does not say which"),
+        ("gym:Pendulum-v1", {"max_episode_steps": 0}, "max_episode_steps=0 is impossible"),
+        ("hoper-v", {}, "did you mean hopper-v?"),
+    ],
+)
+def test_a_task_that_cannot_be_made_is_a_sentence(name, given, phrase):
+    with pytest.raises(UserError) as error:
+        tasks.make(name, **given)
+    assert phrase in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("name", "extra"), [("hopper", "robots"), ("gym:Hopper-v5", "mujoco")])
+def test_without_the_extra_there_is_the_command_to_install_it(name, extra, monkeypatch):
+    for module in ("pybullet_envs_gymnasium", "mujoco", "gymnasium.envs.mujoco", "gymnasium.envs.mujoco.hopper_v5"):
+        monkeypatch.setitem(__import__("sys").modules, module, None)
+    with pytest.raises(UserError, match=rf"pip install 'beliefrl\[{extra}\]'"):
+        _ = tasks.make(name).spec
+
+
+@pytest.mark.parametrize("known", tasks.registered.ROBOTS, ids=str)
+def test_robots_have_the_observations_of_their_masks(known):
+    pytest.importorskip("pybullet_envs_gymnasium")
+    robot = tasks.registered.ROBOTS[known]
+    size = len(robot.velocities) + len(robot.positions)
+    assert tasks.make(known).spec.obs_dim == size
+    assert tasks.make(f"{known}-v").spec.obs_dim == len(robot.velocities)
+    assert tasks.make(f"{known}-p").environment().reset(seed=0)[0].shape == (len(robot.positions),)
+
+
+@pytest.mark.parametrize("known", [each for each in tasks.registered.GYMNASIUMS if each.extra], ids=lambda k: k.id)
+def test_velocities_of_mujoco_are_the_simulators(known):
+    pytest.importorskip("mujoco")
+    pytest.importorskip("imageio")
+    environment = tasks.make(f"gym:{known.id}").environment()
+    environment.reset(seed=0)
+    obs = environment.step(np.full(environment.action_space.shape, 0.3, np.float32))[0]
+    assert len(obs) == len(known.velocities) + len(known.positions)
+    velocities = environment.inner.unwrapped.data.qvel
+    limit = np.abs(obs).max() if known.id == "Ant-v5" else 10.0  # others are clipped
+    np.testing.assert_allclose(obs[list(known.velocities)], np.clip(velocities, -limit, limit), rtol=1e-5)
+
+
+def test_an_environment_is_one_that_others_can_use():
+    environment = GymnasiumTask(Fine).environment()
+    assert isinstance(environment, gymnasium.Env)
+    assert environment.observation_space.shape == BOX.shape
+    assert environment.action_space == spaces.Box(-1.0, 1.0, (1,), np.float32)

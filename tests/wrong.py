@@ -1,0 +1,170 @@
+"""Environments that do what none may do, one for each way of going wrong."""
+
+import os
+import signal
+import sys
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+
+class Fine(gymnasium.Env):
+    """Nothing wrong: two numbers are observed, one is done, an episode has ten steps."""
+
+    observation_space = BOX
+    action_space = spaces.Box(-2.0, 6.0, (1,), np.float32)
+
+    def __init__(self, **changes):
+        for name, value in changes.items():
+            setattr(self, name, value)
+        self.time = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.time = 0
+        return self.observe(), {}
+
+    def observe(self):
+        return self.np_random.uniform(-1, 1, 2).astype(np.float32)
+
+    def reward(self):
+        return 1.0
+
+    def end(self):
+        return False, self.time >= 10
+
+    def step(self, action):
+        self.action, self.time = action, self.time + 1
+        return (*[self.observe(), self.reward()], *self.end(), {"success": self.time >= 10})
+
+
+def when(late, now):
+    """A method that gives `now()` at the third step of an episode and `late` as usual before."""
+
+    def method(self):
+        return now(self) if self.time == 3 else late(self)
+
+    return method
+
+
+def with_observation(value):
+    observe = when(Fine.observe, lambda self: value() if callable(value) else value)
+    return type("Fine", (Fine,), {"observe": observe})
+
+
+def with_reward(value):
+    return type("Fine", (Fine,), {"reward": when(Fine.reward, lambda self: value)})
+
+
+def with_end(*values):
+    return type("Fine", (Fine,), {"end": when(Fine.end, lambda self: values)})
+
+
+def with_step(function):
+    def step(self, action):
+        result = Fine.step(self, action)
+        return function(self, result) if self.time == 3 else result
+
+    return type("Fine", (Fine,), {"step": step})
+
+
+def raising(error):
+    def function(self, result):
+        raise error
+
+    return with_step(function)
+
+
+def changing(self, result):
+    self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+    return result
+
+
+class Dictionary(Fine):
+    observation_space = spaces.Dict({"a": BOX, "b": spaces.Discrete(3)})
+
+    def observe(self):
+        return {"a": np.zeros(2, np.float32)} if self.time == 3 else {"a": np.ones(2, np.float32), "b": 1}
+
+
+class Endless(Fine):
+    def end(self):
+        return False, False
+
+
+def reset_of(value):
+    return type("Fine", (Fine,), {"reset": lambda self, **_: value})
+
+
+def failing_reset(self, **_):
+    raise RuntimeError("no robot is connected")
+
+
+def failing_init(self):
+    raise OSError("cannot open /dev/robot")
+
+
+def spaced(**given):
+    return type("Fine", (Fine,), given)
+
+
+UNSUPPORTED = {  # what is made: a word of the sentence
+    spaced(action_space=spaces.Discrete(3)): "not discrete",
+    spaced(action_space=spaces.Dict({"a": BOX})): "not discrete or composite",
+    spaced(action_space=spaces.Box(-np.inf, np.inf, (1,), np.float32)): "unbounded",
+    spaced(action_space=spaces.Box(0, 3, (1,), np.int32)): "real numbers",
+    spaced(action_space=spaces.Box(-1.0, 1.0, (), np.float32)): "at least one number",
+    spaced(action_space=None): "has the actions None",
+    spaced(observation_space=spaces.Box(0, 255, (64, 64, 3), np.uint8)): "images",
+    spaced(observation_space=spaces.Graph(BOX, None)): "has the observations Graph",
+    spaced(observation_space=spaces.Sequence(BOX)): "what flattens to one",
+    spaced(observation_space=spaces.Box(-1.0, 1.0, (0,), np.float32)): "without numbers",
+    spaced(observation_space=None): "observations None",
+    spaced(__init__=failing_init): "OSError: cannot open /dev/robot",
+    lambda: None: "robot has the actions None",
+}
+
+FAULTS = {  # what is made: (a phrase of the sentence, the step that it names)
+    raising(ZeroDivisionError("division by zero")): ("step raised ZeroDivisionError: division by zero", 3),
+    raising(RuntimeError("100 %\n  of two lines\n")): ("step raised RuntimeError: 100 % of two lines", 3),
+    raising(AssertionError()): ("step raised AssertionError", 3),
+    with_step(lambda self, result: sys.exit("bye")): ("step raised SystemExit: bye", 3),
+    with_step(lambda self, result: result[:2] + result[3:]): ("step returned no five", 3),
+    with_step(lambda self, result: None): ("step returned no five", 3),
+    with_step(changing): ("its action space changed from Box(-2.0, 6.0", 3),
+    with_observation(np.array([0.0, np.nan])): ("entry 1 of the observation is nan", 3),
+    with_observation(np.array([np.inf, 0.0])): ("entry 0 of the observation is inf", 3),
+    with_observation(np.array([1e300, 0.0])): ("entry 0 of the observation is 1e+300", 3),
+    with_observation(np.zeros(3)): ("the observation has shape (3,), where its space says (2,)", 3),
+    with_observation(np.zeros((1, 2))): ("the observation has shape (1, 2)", 3),
+    with_observation(0.5): ("the observation has shape ()", 3),
+    with_observation(np.array(["left", "right"])): ("the observation is of type <U5", 3),
+    with_observation(np.zeros(2, complex)): ("the observation is of type complex128", 3),
+    with_observation([[1.0], [2.0, 3.0]]): ("the observation is of type object", 3),
+    with_observation(None): ("the observation is of type object", 3),
+    Dictionary: ("the observation does not fit its space Dict", 3),
+    with_reward(float("nan")): ("the reward is nan", 3),
+    with_reward(float("inf")): ("the reward is inf", 3),
+    with_reward(-1e200): ("the reward is -1e+200", 3),
+    with_reward(np.ones(1)): ("the reward is of shape (1,), where it must be one number", 3),
+    with_reward(None): ("the reward is None", 3),
+    with_reward("much"): ("the reward is 'much'", 3),
+    with_end(None, False): ("terminated is None, where it must be True or False", 3),
+    with_end(False, "soon"): ("truncated is 'soon'", 3),
+    with_end(2, False): ("terminated is 2", 3),
+    Endless: ("the episode has not ended after 25 steps", 25),
+    spaced(reset=failing_reset): ("reset raised RuntimeError: no robot is connected", 0),
+    reset_of(np.zeros(2, np.float32)): ("reset returned no pair", 0),
+    reset_of((np.full(2, np.nan), {})): ("entry 0 of the observation is nan", 0),
+}
+
+
+def killed(self, result):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+Killed = with_step(killed)
+Raising = raising(ValueError("out of range"))
