@@ -14,7 +14,7 @@ from sb3_contrib import RecurrentPPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
-from beliefrl.environment import register
+import beliefrl  # noqa: F401 - after it, gymnasium.make knows BeliefRL/...
 
 
 def main() -> None:
@@ -24,7 +24,6 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
 
-    register()  # after it, gymnasium.make knows BeliefRL/...
     environments = make_vec_env("BeliefRL/PendulumV-v0", n_envs=8, seed=args.seed)
     settings = {"learning_rate": 1e-3, "gamma": 0.9, "n_steps": 128, "batch_size": 512}
     agent = RecurrentPPO("MlpLstmPolicy", environments, **settings, seed=args.seed)

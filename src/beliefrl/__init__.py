@@ -13,19 +13,23 @@ from importlib.metadata import version
 from beliefrl.agents import Agent
 from beliefrl.agents import make as make_agent
 from beliefrl.analysis.curves import draw_curve
-from beliefrl.evaluation import evaluate
+from beliefrl.environment import TaskEnvironment, register
+from beliefrl.evaluation import evaluate, task_of
 from beliefrl.policy import Policy, load
 from beliefrl.runs import Run
 from beliefrl.tasks import Task, observe
 from beliefrl.tasks import make as make_task
+from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.train import Event, Options, train
 from beliefrl.types import Moment, Spec, Step, UserError, Window, WindowShape
 
 __version__ = version("beliefrl")
+register()  # gymnasium.make("BeliefRL/PendulumV-v0")
 
 __all__ = [
     "Agent",
     "Event",
+    "GymnasiumTask",
     "Moment",
     "Options",
     "Policy",
@@ -33,6 +37,7 @@ __all__ = [
     "Spec",
     "Step",
     "Task",
+    "TaskEnvironment",
     "UserError",
     "Window",
     "WindowShape",
@@ -42,5 +47,6 @@ __all__ = [
     "make_agent",
     "make_task",
     "observe",
+    "task_of",
     "train",
 ]

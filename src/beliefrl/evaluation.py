@@ -48,19 +48,25 @@ def restore(run: Run, task: Task | GymnasiumTask | None = None) -> tuple[Agent, 
     Raises:
         UserError: the run's agent or task is unknown here, or nothing was saved.
     """
-    config = run.config
-    agent = agents.make(config["agent"], **_tuples(config["hyperparameters"]))
-    made: Any = task
-    if task is None:
-        if not tasks.knows(config["task"]):
-            raise UserError(
-                f"{run.folder} was trained on {config['task']}, which is not a task of this library: pass task=."
-            )
-        made = tasks.make(config["task"], config.get("observe"), **_tuples(config["constants"]))
-    spec = made.spec
+    agent = agents.make(run.config["agent"], **_tuples(run.config["hyperparameters"]))
+    found = task_of(run) if task is None else task
+    spec = found.spec
     keys = jax.random.split(jax.random.key(0), len(run.seeds))
     like = jax.eval_shape(jax.vmap(lambda key: agent.init(key, spec)), keys)
-    return agent, made, run.load(like)
+    return agent, found, run.load(like)
+
+
+def task_of(run: Run | str | os.PathLike[str]) -> Any:
+    """The task that a run was trained on, as `make_task` makes it; a `gym:PACKAGE:ID` imports its package.
+
+    Raises:
+        UserError: there is no such run, or it was trained on a task of your own, which cannot be found by a name.
+    """
+    run = run if isinstance(run, Run) else Run(run)
+    name, constants = run.config["task"], _tuples(run.config["constants"])
+    if not tasks.knows(name):
+        raise UserError(f"{run.folder} was trained on {name}, which is not a task of this library: pass task=.")
+    return tasks.make(name, run.config.get("observe"), **constants)
 
 
 def _tuples(values: dict[str, Any]) -> dict[str, Any]:

@@ -20,7 +20,8 @@ from beliefrl.types import Spec, UserError
 class Task(Protocol):
     """A frozen dataclass of physical constants with pure methods; no time limit and no reset of its own.
 
-    `rollout` cuts episodes at `spec.max_steps` and resets them.
+    `rollout` cuts episodes at `spec.max_steps` and resets them. A task that can be seen also has `draw(states)`, the
+    `drawing.Picture` of an episode's states so far.
     """
 
     @property

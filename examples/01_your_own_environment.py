@@ -1,0 +1,63 @@
+"""Your own environment: anything with Gymnasium's interface, here a cart that must stop at a mark it drives towards.
+
+    pip install beliefrl
+    python examples/01_your_own_environment.py                  # 6,000 steps: about four minutes
+    python examples/01_your_own_environment.py --steps 300      # to see it run
+
+An environment that is registered needs no Python at all; `my_robots` is the module that registers it:
+
+    beliefrl train vrm gym:my_robots:Cart-v0 --observe 0 --seeds 2
+    beliefrl train vrm gym:MountainCarContinuous-v0 --observe 0 --constants max_episode_steps=500
+
+Actions arrive in the range of the environment's own Box. `observe` keeps entries of the observation from the agent, here
+the cart's speed, which has to be told from where it was.
+"""
+
+import gymnasium
+import numpy as np
+import tyro
+
+import beliefrl
+
+
+class Cart(gymnasium.Env):
+    """A cart on a track; the force is in newtons, the mark is somewhere else in every episode."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float32)  # distance to the mark m, speed m/s
+    action_space = gymnasium.spaces.Box(-3.0, 3.0, (1,), np.float32)  # force, N
+
+    def reset(self, *, seed=None, options=None):
+        """Somewhere, at rest."""
+        super().reset(seed=seed)
+        self.distance, self.speed = self.np_random.uniform(-2.0, 2.0), 0.0
+        return self.observation(), {}
+
+    def step(self, action):
+        """A tenth of a second; the reward is how near it is."""
+        self.speed += 0.1 * float(action[0])
+        self.distance += 0.1 * self.speed
+        return self.observation(), -abs(self.distance), False, False, {}
+
+    def observation(self):
+        return np.array([self.distance, self.speed], np.float32)
+
+
+def main(steps: int = 6_000, agent: str = "sac-lstm", out: str = "runs/cart") -> None:
+    """Train without the speed. Episodes have no end of their own, so a time limit of 60 steps is set."""
+    task = beliefrl.GymnasiumTask(Cart, indices=(0,), max_steps=60)
+    run = beliefrl.train(agent, task, out, steps=steps, eval_every=1_000)
+
+    for row in run.rows(seed=0, kind="evaluation"):
+        print(f"step {row['step']}: return {np.mean(row['mode']):.1f}")
+    policy, environment = beliefrl.load(run, task=task), task.environment()
+    obs, _ = environment.reset(seed=1)
+    action, state = policy.predict(obs)
+    for step in range(40):
+        obs, reward, _, _, _ = environment.step(action)
+        action, state = policy.predict(obs, reward, state)
+        if step % 10 == 9:
+            print(f"after {(step + 1) / 10:.0f} s it is {abs(obs[0]):.2f} m from the mark")
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,59 @@
+"""A task in pure JAX: it compiles together with the agent, so many seeds train in one program.
+
+    pip install beliefrl
+    python examples/02_a_task_in_jax.py                  # 5,000 steps, four seeds: about ten minutes on two cores
+    python examples/02_a_task_in_jax.py --steps 300      # to see it run
+
+A light shows for the first moment of an episode where a lamp stands, left or right; after a while in the dark one must
+point there. Without memory the best return is 0; with it, it is near 1.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import tyro
+from jaxtyping import Array, Bool, Float, Key
+
+import beliefrl
+
+
+@dataclasses.dataclass(frozen=True)
+class Lamp:
+    """Remember a side; one number is observed, one is done. The fields are the task's constants."""
+
+    wait: int = 6  # steps in the dark
+
+    @property
+    def spec(self) -> beliefrl.Spec:
+        """The sizes, and the time limit; `step` never ends an episode by itself here."""
+        return beliefrl.Spec(obs_dim=1, action_dim=1, max_steps=self.wait)
+
+    def reset(self, key: Key[Array, ""]) -> tuple[tuple[Array, Array], Float[Array, "1"]]:
+        """The side is the state, besides the time; it is seen only now."""
+        side = jax.random.choice(key, jnp.array([-1.0, 1.0]))
+        return (side, jnp.array(0)), side[None]
+
+    def step(
+        self, state: tuple[Array, Array], action: Float[Array, "1"], key: Key[Array, ""]
+    ) -> tuple[tuple[Array, Array], Float[Array, "1"], Float[Array, ""], Bool[Array, ""]]:
+        """Only the last action counts."""
+        side, time = state
+        reward = jnp.where(time + 1 == self.wait, side * action[0], 0.0)
+        return (side, time + 1), jnp.zeros(1), reward, jnp.array(False)
+
+    def success(self, state: tuple[Array, Array]) -> Bool[Array, ""]:
+        """There is none here besides the return: see `has_success` of the spec."""
+        return jnp.array(False)
+
+
+def main(steps: int = 5_000, seeds: int = 4, agent: str = "sac-lstm", out: str = "runs/lamp") -> None:
+    """Train with memory, `seeds` seeds side by side."""
+    task = Lamp()
+    run = beliefrl.train(agent, task, out, steps=steps, seeds=seeds, eval_every=1_000, eval_episodes=20)
+    results = beliefrl.evaluate(run, episodes=50, task=task)
+    print(f"return of each seed: {[round(total, 2) for total in results['mode']['seeds']]}")
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
