@@ -9,8 +9,8 @@ An environment that is registered needs no Python at all; `my_robots` is the mod
     beliefrl train vrm gym:my_robots:Cart-v0 --observe 0 --seeds 2
     beliefrl train vrm gym:MountainCarContinuous-v0 --observe 0 --constants max_episode_steps=500
 
-Actions arrive in the range of the environment's own Box. `observe` keeps entries of the observation from the agent, here
-the cart's speed, which has to be told from where it was.
+Actions arrive in the range of the environment's own Box. Of the observation the agent sees the entries `observe` (here
+`indices`): not the cart's speed, which has to be told from where it was.
 """
 
 import gymnasium
