@@ -12,6 +12,7 @@ from beliefrl import cli, tasks
 TRAIN = "train vrm pendulum-v"
 AGENTS = {"vrm", "sac-mlp", "sac-lstm", "slac", "vrm-single", "vrm-first", "vrm-keep", "vrm-deterministic"}
 TASKS = {"pendulum", "pendulum-v", "pendulum-p", "cartpole", "cartpole-v", "cartpole-p", "target-reaching"}
+ROBOTS = {name + mask for name in ("hopper", "walker2d", "ant", "halfcheetah") for mask in ("", "-v", "-p")}
 
 
 def printed(capsys, line):
@@ -36,7 +37,9 @@ def test_the_help_of_training_shows_hyperparameters_and_where_they_stand(capsys)
 
 
 def test_tasks_and_agents_are_listed_one_a_line(capsys):
-    assert {line.split()[0] for line in printed(capsys, "tasks").splitlines()} == TASKS
+    listed = {line.split()[0] for line in printed(capsys, "tasks").splitlines()}
+    assert {name for name in listed if not name.startswith("gym:")} == TASKS | ROBOTS
+    assert {"gym:Hopper-v5", "gym:MountainCarContinuous-v0", "gym:ID"} < listed
     assert {line.split()[0] for line in printed(capsys, "agents").splitlines()} == AGENTS
 
 

@@ -167,7 +167,7 @@ def list_tasks(argv: Sequence[str]) -> None:
     parse(ListOptions, argv, "beliefrl tasks")
     from beliefrl import tasks
 
-    _print_names(tasks.names())
+    _print_names(tasks.names() | tasks.registered.names())
 
 
 def list_agents(argv: Sequence[str]) -> None:

@@ -22,7 +22,8 @@ KEYS = jax.random.split(jax.random.key(0), 5)
 
 
 def test_the_listed_names_are_the_tasks_there_are():
-    assert list(names()) == list(SIZES)
+    robots = [name + mask for name in ("hopper", "walker2d", "ant", "halfcheetah") for mask in ("", "-v", "-p")]
+    assert list(names()) == [*SIZES, *robots]
     assert all(names().values())
 
 

@@ -6,6 +6,7 @@ classic ones are Gymnasium's own.
 """
 
 import contextlib
+import ctypes
 import importlib
 import os
 import pathlib
@@ -20,6 +21,7 @@ from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.types import UserError
 
 PREFIX = "gym:"
+BULLET = "pybullet_envs_gymnasium"
 
 
 class Known(NamedTuple):
@@ -39,13 +41,15 @@ def _known(id: str, about: str, size: int, velocities: tuple[int, ...], extra: s
 def _bullet(robot: str, joints: int, feet: int) -> Known:
     velocities = (3, 4, 5, *range(9, 8 + 2 * joints, 2))
     about = f"PyBullet's {robot}: run forward."
-    id = f"pybullet_envs_gymnasium:{robot}BulletEnv-v0"
+    id = f"{BULLET}:{robot}BulletEnv-v0"
     return _known(id, about, 8 + 2 * joints + feet, velocities, "robots")
 
 
 def _mujoco(id: str, size: int, velocities: tuple[int, ...]) -> Known:
     return _known(id, f"MuJoCo's {id.split('-')[0]}.", size, velocities, "mujoco")
 
+
+ANY = "gym:ID or gym:PACKAGE:ID"
 
 ROBOTS: dict[str, Known] = {
     "hopper": _bullet("Hopper", joints=3, feet=1),
@@ -69,6 +73,16 @@ GYMNASIUMS: tuple[Known, ...] = (
 KNOWN: dict[str, Known] = {known.id: known for known in (*ROBOTS.values(), *GYMNASIUMS)}
 
 
+def names() -> dict[str, str]:
+    """Gymnasium's environments whose masks are known by name, with a sentence on each; and what else there is."""
+    listed = {}
+    for known in GYMNASIUMS:
+        extra = f" Needs the extra `{known.extra}`." if known.extra else ""
+        listed[PREFIX + known.id] = f"{known.about} --observe velocities or positions.{extra}"
+    listed[ANY] = "Any other Gymnasium environment with bounded continuous actions; --observe takes indices."
+    return listed
+
+
 def make(id: str, arguments: dict[str, Any], name: str | None = None) -> GymnasiumTask:
     """The task of a Gymnasium id, `Id` or `package:Id`, which imports the package that registers it.
 
@@ -86,7 +100,10 @@ def make(id: str, arguments: dict[str, Any], name: str | None = None) -> Gymnasi
         with _quiet() if package else contextlib.nullcontext():
             if package:
                 importlib.import_module(package)  # in a process of its own it has not been yet
-            return gymnasium.make(id.rpartition(":")[2], disable_env_checker=True, **arguments)
+            environment = gymnasium.make(id.rpartition(":")[2], disable_env_checker=True, **arguments)
+            if package == BULLET:
+                environment.reset()  # only now PyBullet begins, and says so
+        return environment
 
     try:
         gymnasium.spec(id.rpartition(":")[2])
@@ -136,14 +153,19 @@ def _first_sentence(found: Exception) -> str:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Nothing on standard output: PyBullet writes there from C whenever an environment is made."""
+    """Nothing on the screen: PyBullet writes there from C when it is imported and whenever an environment begins."""
+    screens = (1, 2)
     sys.stdout.flush()
-    kept = os.dup(1)
+    kept = [os.dup(screen) for screen in screens]
     try:
         with pathlib.Path(os.devnull).open("wb") as nowhere:
-            os.dup2(nowhere.fileno(), 1)
+            for screen in screens:
+                os.dup2(nowhere.fileno(), screen)
         yield
     finally:
         sys.stdout.flush()
-        os.dup2(kept, 1)
-        os.close(kept)
+        if os.name == "posix":
+            ctypes.CDLL(None).fflush(None)  # what C has not written yet
+        for screen, where in zip(screens, kept, strict=True):
+            os.dup2(where, screen)
+            os.close(where)
