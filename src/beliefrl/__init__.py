@@ -17,10 +17,12 @@ from beliefrl.environment import TaskEnvironment, register
 from beliefrl.evaluation import evaluate, task_of
 from beliefrl.policy import Policy, load
 from beliefrl.runs import Run
+from beliefrl.schedule import Event, Options
+from beliefrl.stop import Stopped
 from beliefrl.tasks import Task, observe
 from beliefrl.tasks import make as make_task
 from beliefrl.tasks.gymnasium import GymnasiumTask
-from beliefrl.train import Event, Options, train
+from beliefrl.train import resume, train
 from beliefrl.types import Moment, Spec, Step, UserError, Window, WindowShape
 
 __version__ = version("beliefrl")
@@ -36,6 +38,7 @@ __all__ = [
     "Run",
     "Spec",
     "Step",
+    "Stopped",
     "Task",
     "TaskEnvironment",
     "UserError",
@@ -47,6 +50,7 @@ __all__ = [
     "make_agent",
     "make_task",
     "observe",
+    "resume",
     "task_of",
     "train",
 ]

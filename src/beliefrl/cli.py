@@ -20,6 +20,7 @@ HELP = """usage: beliefrl COMMAND ...
 Reinforcement learning for agents that do not see the whole state.
 
   beliefrl train AGENT TASK     train, with a live view, into a run's folder
+  beliefrl resume RUN           go on with a training that was stopped or killed, or train it longer
   beliefrl evaluate RUN         play new episodes with what a run has learned
   beliefrl export RUN FILE      write the learned policy as one file that jax loads without this library
   beliefrl tasks                list the tasks
@@ -40,6 +41,16 @@ with their defaults and where in the paper they stand.
 A run's folder holds config.json, metrics/ (a line of JSON for every entry), tensorboard/, the trained agents,
 results.json and curve.png. Mistakes end with one sentence and exit code 2.
 """
+
+
+@dataclasses.dataclass(frozen=True)
+class ResumeOptions:
+    """Go on with a training from its last checkpoint, as if it had never stopped."""
+
+    run: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="RUN")]
+    """The run's folder."""
+    steps: int | None = None
+    """Train for so many environment steps in all; None: as many as before. They may only grow."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,8 +89,10 @@ def train(argv: Sequence[str]) -> None:
     from rich.console import Console
 
     from beliefrl import agents, tasks
-    from beliefrl.display import TrainingDisplay, results_table
-    from beliefrl.train import Options
+    from beliefrl.checkpoint import listed
+    from beliefrl.display import TrainingDisplay
+    from beliefrl.runs import Run
+    from beliefrl.schedule import Options
     from beliefrl.train import train as run_training
 
     name, rest = agent_name(argv, "train", "TASK")
@@ -121,18 +134,67 @@ def train(argv: Sequence[str]) -> None:
                 ],
                 None,
             ),
+            "resume": (
+                Annotated[bool, tyro.conf.arg(help="Go on with the training in --out, if there is one already.")],
+                False,
+            ),
         },
     )
     options = parse(options_type, rest, f"beliefrl train {name}")
     task = tasks.make(options.task, options.observe or None, **named_values(options.constants, "--constants"))
     console = Console()
+    if options.resume and options.out is not None and listed(options.out):
+        _same_training(Run(options.out), name, options)
+        _resume(options.out, options.training.steps)
+        return
     with TrainingDisplay(console, options.training.steps) as display:
         run = run_training(options.agent, task, options.out, display, **dataclasses.asdict(options.training))
-    results = run.results() or {}
-    title = f"{name} on {options.task} after {results['step']:,} steps"
+    _ended(run)
+
+
+def _ended(run: Any) -> None:
+    """What a finished training is worth, and where it lies."""
+    from rich.console import Console
+
+    from beliefrl.display import results_table
+
+    console, results = Console(), run.results() or {}
+    title = f"{run.config['agent']} on {run.config['task']} after {results['step']:,} steps"
     console.print(results_table(results, run.seeds, title))
     told = f"saved in {run.folder}: see curve.png; `beliefrl evaluate {run.folder}` plays more episodes"
     console.print(told, markup=False, highlight=False, soft_wrap=True)
+
+
+def _same_training(run: Any, agent: str, options: Any) -> None:
+    """Refuse to go on with a run that is of something else than the command line says."""
+    from beliefrl.types import UserError
+
+    asked = {"agent": agent, "task": options.task, **dataclasses.asdict(options.training)}
+    asked |= dataclasses.asdict(options.agent)
+    there = {**run.config["options"], **run.config["hyperparameters"]}
+    there |= {"agent": run.config["agent"], "task": run.config["task"], "steps": options.training.steps}
+    for name, value in asked.items():
+        value = list(value) if isinstance(value, tuple) else value
+        if there.get(name, value) != value:
+            raise UserError(f"{run.folder} was trained with {name}={there[name]}, not {value}: choose another --out.")
+
+
+def resume(argv: Sequence[str]) -> None:
+    """`beliefrl resume RUN ...`."""
+    options = parse(ResumeOptions, argv, "beliefrl resume")
+    _resume(options.run, options.steps)
+
+
+def _resume(folder: pathlib.Path, steps: int | None) -> None:
+    from rich.console import Console
+
+    from beliefrl.display import TrainingDisplay
+    from beliefrl.runs import Run
+    from beliefrl.train import resume as go_on
+
+    run = Run(folder)
+    with TrainingDisplay(Console(), steps or run.config["options"]["steps"]) as display:
+        _ended(go_on(run, steps, report=display))
 
 
 def evaluate(argv: Sequence[str]) -> None:
@@ -216,6 +278,7 @@ def bench(argv: Sequence[str]) -> None:
 
 COMMANDS: dict[str, Callable[[Sequence[str]], None]] = {
     "train": train,
+    "resume": resume,
     "evaluate": evaluate,
     "export": export,
     "tasks": list_tasks,
@@ -259,9 +322,10 @@ def main(argv: Sequence[str] | None = None) -> None:
         COMMANDS[argv[0]](argv[1:])
     except (UsageError, UserError) as error:
         _fail(str(error))
-    except KeyboardInterrupt:
-        print("beliefrl: stopped; what was logged and saved stays in the run's folder.", file=sys.stderr)
-        raise SystemExit(130) from None
+    except KeyboardInterrupt as stopped:
+        what = str(stopped) or "stopped; what was logged and saved stays in the run's folder."
+        print(f"beliefrl: {what}", file=sys.stderr)
+        raise SystemExit(getattr(stopped, "exit_code", 130)) from None
     except BrokenPipeError:
         raise SystemExit(0) from None
     except Exception as error:

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
-from beliefrl.train import Event
+from beliefrl.schedule import Event
 
 
 def duration(seconds: float) -> str:
@@ -47,6 +47,9 @@ class TrainingDisplay:
     def __call__(self, event: Event) -> None:
         """Show an event."""
         now = time.monotonic()
+        if event.note is not None:
+            self._line(now, event.note)
+            return
         if event.doing != self.doing and event.evaluation is None:
             self._begin_phase(event, now)
         if event.episodes is not None and np.any(event.episodes.done):

@@ -48,12 +48,21 @@ def restore(run: Run, task: Task | GymnasiumTask | None = None) -> tuple[Agent, 
     Raises:
         UserError: the run's agent or task is unknown here, or nothing was saved.
     """
-    agent = agents.make(run.config["agent"], **_tuples(run.config["hyperparameters"]))
+    agent = agent_of(run)
     found = task_of(run) if task is None else task
     spec = found.spec
     keys = jax.random.split(jax.random.key(0), len(run.seeds))
     like = jax.eval_shape(jax.vmap(lambda key: agent.init(key, spec)), keys)
     return agent, found, run.load(like)
+
+
+def agent_of(run: Run) -> Agent:
+    """The agent of a run, before it was trained.
+
+    Raises:
+        UserError: it is unknown here.
+    """
+    return agents.make(run.config["agent"], **_tuples(run.config["hyperparameters"]))
 
 
 def task_of(run: Run | str | os.PathLike[str]) -> Any:

@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from beliefrl import phases, rollout
 from beliefrl.agents import Agent
 from beliefrl.lockstep import Lockstep
-from beliefrl.phases import ACT, Metrics, Program, Seed, Stretch, step_key
+from beliefrl.phases import ACT, REVIVE, Metrics, Program, Seed, Stretch, step_key
 from beliefrl.replay import Replay
 from beliefrl.rollout import Actor, Episode
 from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
@@ -48,6 +48,8 @@ def program(
         relive=jax.jit(jax.vmap(partial(phases.relive, agent, task.spec)), donate_argnums=0),
         learn=loop.learn,
         evaluate=partial(evaluation.play, episodes=episodes),
+        shapes=loop.shapes,
+        revive=loop.revive,
         close=close,
     )
 
@@ -69,9 +71,10 @@ class HostLoop:
 
     def __init__(self, agent: Agent, task: GymnasiumTask, capacity: int, seeds: Sequence[int], processes: str):
         """An environment for each of `seeds`."""
-        self.agent = agent
+        self.agent, self.spec = agent, task.spec
         self.environments = Lockstep(task, [f"seed {seed}" for seed in seeds], processes)
         self._begin = jax.jit(jax.vmap(partial(_begin, agent, task.spec, capacity)))
+        self._first = jax.jit(jax.vmap(lambda obs: rollout.first(agent, task.spec, (), obs)))
         self._act = jax.jit(jax.vmap(partial(_act, agent), in_axes=(0, 0, 0, None)))
         record = jax.vmap(partial(_record, agent, task.spec), in_axes=(0, 0, 0, 0, None, 0))
         self._record = jax.jit(record, donate_argnums=1)
@@ -80,6 +83,16 @@ class HostLoop:
     def begin(self, keys: Key[Array, " seed"]) -> Seed:
         """Seeds before their first steps."""
         return self._begin(keys, self.environments.reset(environment_seeds(keys)))
+
+    def shapes(self, keys: Key[Array, " seed"]) -> Seed:
+        """What `begin` gives, without its numbers."""
+        obs = jax.ShapeDtypeStruct((len(keys), self.spec.obs_dim), jnp.float32)
+        return jax.eval_shape(self._begin, keys, obs)
+
+    def revive(self, seeds: Seed, step: int) -> Seed:
+        """Seeds whose environments were not saved: a new episode begins, as if the one in hand had never gone on."""
+        keys = jax.vmap(lambda key: step_key(key, jnp.asarray(step), REVIVE))(seeds.key)
+        return seeds._replace(actor=self._first(self.environments.reset(environment_seeds(keys))))
 
     def explore(self, seeds: Seed, first: int, steps: int) -> tuple[Seed, Stretch]:
         """Environment steps without updates."""

@@ -77,7 +77,7 @@ def step_key(key: Key[Array, ""], step: Int[Array, ""], purpose: int) -> Key[Arr
     return jax.random.fold_in(jax.random.fold_in(key, purpose), step)
 
 
-ACT, UPDATE, SAMPLE, CYCLE, PRETRAIN, RELIVE, EVALUATE = range(7)  # purposes of keys: no two share one
+ACT, UPDATE, SAMPLE, CYCLE, PRETRAIN, RELIVE, EVALUATE, REVIVE = range(8)  # purposes of keys: no two share one
 
 
 def explore(agent: Agent, task: Task, seed: Seed, first: Int[Array, ""], steps: Int[Array, ""]) -> tuple[Seed, Stretch]:
@@ -187,6 +187,8 @@ class Program(NamedTuple):
     relive: Callable[..., Seed]  # seeds
     learn: Callable[..., tuple[Seed, Stretch]]  # seeds, first, cycles
     evaluate: Callable[..., Episode]  # states (seed, ...), keys (seed,); leaves (seed, 2, episodes)
+    shapes: Callable[..., Seed]  # keys (seed,); what `begin` gives, without its numbers
+    revive: Callable[..., Seed] = lambda seeds, step: seeds  # after they were read from a checkpoint
     close: Callable[[], None] = lambda: None  # when no phase will be called any more
 
 
@@ -196,11 +198,13 @@ def compile_program(agent: Agent, task: Task, capacity: int, episodes: int) -> P
     def mapped(function: Callable[..., Any], numbers: int) -> Callable[..., Any]:
         return jax.jit(jax.vmap(function, in_axes=(0, *[None] * numbers)), donate_argnums=0)
 
+    start = jax.jit(jax.vmap(partial(begin, agent, task, capacity)))
     return Program(
-        begin=jax.jit(jax.vmap(partial(begin, agent, task, capacity))),
+        begin=start,
         explore=mapped(partial(explore, agent, task), 2),
         pretrain=mapped(partial(pretrain, agent), 2),
         relive=mapped(partial(relive, agent, task.spec), 0),
         learn=mapped(partial(learn, agent, task), 2),
         evaluate=jax.jit(jax.vmap(partial(evaluate, agent, task, episodes=episodes))),
+        shapes=partial(jax.eval_shape, start),
     )

@@ -17,8 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from beliefrl.agents import Agent
+from beliefrl.arrays import write_whole
 from beliefrl.evaluation import restore
-from beliefrl.runs import Run, write_whole
+from beliefrl.runs import Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.types import LARGEST, Spec, Step, UserError

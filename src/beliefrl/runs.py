@@ -14,6 +14,8 @@ import json
 import os
 import pathlib
 import platform
+import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -23,9 +25,9 @@ from typing import Any
 
 import jax
 import numpy as np
-import safetensors
-import safetensors.numpy
 
+from beliefrl import arrays
+from beliefrl.arrays import write_whole
 from beliefrl.types import UserError
 
 Row = dict[str, Any]
@@ -88,51 +90,75 @@ class Run:
         path = self.folder / "agent.safetensors"
         if not path.exists():
             raise UserError(f"{self.folder} has no trained agent yet: it is saved at the first evaluation.")
-        try:
-            saved = safetensors.numpy.load_file(path)
-        except (OSError, safetensors.SafetensorError):
-            raise UserError(f"{path} is damaged: restore it from a copy, or train again.") from None
-        leaves, structure = jax.tree_util.tree_flatten_with_path(like)
-        names = [jax.tree_util.keystr(where) for where, _ in leaves]
-        for name, (_, leaf) in zip(names, leaves, strict=True):
-            if name not in saved or saved[name].shape != leaf.shape or saved[name].dtype != leaf.dtype:
-                raise UserError(
-                    f"{path} does not fit the agent in config.json (at {name}): they are not of one training."
-                )
-        return jax.tree_util.tree_unflatten(structure, [saved[name] for name in names])
+        return arrays.read(path, like)
 
 
 class Recorder(Run):
-    """A run's folder, to be written."""
+    """A run's folder, to be written by this process alone."""
 
-    def __init__(self, folder: str | os.PathLike[str], config: dict[str, Any]):
-        """Make the folder.
+    def __init__(self, folder: str | os.PathLike[str], config: dict[str, Any] | None):
+        """Make the folder; without a config, go on with one that exists.
 
         Raises:
-            UserError: it exists already, or cannot be made.
+            UserError: it exists already, or cannot be made; or does not exist, or another process writes it.
         """
         folder = pathlib.Path(folder)
-        try:
-            folder.mkdir(parents=True)
-            (folder / "metrics").mkdir()
-            write_whole(folder / "config.json", (json.dumps(config, indent=2, default=str) + "\n").encode())
-        except FileExistsError:
-            raise UserError(f"{folder} exists already: choose another --out.") from None
-        except OSError as error:
-            raise UserError(
-                f"The run folder {folder} cannot be made ({error.strerror}): choose another --out."
-            ) from None
+        if config is not None:
+            _make(folder, config)
         super().__init__(folder)
+        self._lock = _locked(folder)
+        self._lines: dict[int, Any] = {}
+        self._events: dict[int, Any] = {}
+        if config is not None:
+            self._open()
+
+    def _open(self) -> None:
         from tensorboardX import SummaryWriter  # 0.5 s to import
 
-        self._lines = {seed: (folder / "metrics" / f"seed-{seed}.jsonl").open("a", buffering=1) for seed in self.seeds}
-        self._events = {seed: SummaryWriter(str(folder / "tensorboard" / f"seed-{seed}")) for seed in self.seeds}
+        self._lines = {seed: self._metrics(seed).open("a", buffering=1) for seed in self.seeds}
+        self._events = {seed: SummaryWriter(str(self.folder / "tensorboard" / f"seed-{seed}")) for seed in self.seeds}
+
+    def _metrics(self, seed: int) -> pathlib.Path:
+        return self.folder / "metrics" / f"seed-{seed}.jsonl"
+
+    def amend(self, changes: dict[str, Any], session: dict[str, Any]) -> None:
+        """Change the config, and add what goes on with the run to its `resumed`."""
+        self.config |= changes
+        self.config["resumed"] = [*self.config.get("resumed", ()), session]
+        _write_config(self.folder, self.config)
+
+    def lengths(self) -> dict[int, int]:
+        """Bytes in the log of each seed, which are on the disk then."""
+        for lines in self._lines.values():
+            lines.flush()
+            os.fsync(lines.fileno())
+        return {seed: self._metrics(seed).stat().st_size for seed in self.seeds}
+
+    def rewind(self, lengths: dict[int, int]) -> None:
+        """Cut the log of each seed back to so many bytes, and go on from there.
+
+        Raises:
+            UserError: a log is shorter.
+        """
+        for seed, length in lengths.items():
+            path = self._metrics(seed)
+            if not path.exists() or path.stat().st_size < length:
+                raise UserError(f"{path} is shorter than when the checkpoint was written: restore it from a copy.")
+            os.truncate(path, length)
+        shutil.rmtree(self.folder / "tensorboard", ignore_errors=True)
+        self._open()
+        for seed in self.seeds:
+            for row in self.rows(seed):
+                self._log_event(seed, row["kind"], row["step"], row)
 
     def log(self, seed: int, kind: str, step: int, values: Row) -> None:
         """Write one entry of a seed; numbers go to TensorBoard as well, of lists their mean."""
         self._lines[seed].write(json.dumps({"step": step, "kind": kind, **values}) + "\n")
+        self._log_event(seed, kind, step, values)
+
+    def _log_event(self, seed: int, kind: str, step: int, values: Row) -> None:
         for name, value in values.items():
-            if value is not None:
+            if name not in ("step", "kind") and isinstance(value, int | float | list):
                 self._events[seed].add_scalar(f"{kind}/{name}", float(np.mean(value)), step)
 
     def flush(self) -> None:
@@ -142,9 +168,7 @@ class Recorder(Run):
 
     def save(self, agents: Any) -> None:
         """Save the agents of all seeds; the file appears whole or not at all."""
-        leaves = jax.tree_util.tree_leaves_with_path(agents)
-        arrays = {jax.tree_util.keystr(where): np.ascontiguousarray(leaf) for where, leaf in leaves}
-        write_whole(self.folder / "agent.safetensors", safetensors.numpy.save(arrays))
+        write_whole(self.folder / "agent.safetensors", arrays.packed(arrays.copied(agents)))
 
     def finish(self, results: Row) -> None:
         """Write the summary of the last evaluation and close the logs."""
@@ -152,9 +176,48 @@ class Recorder(Run):
         self.close()
 
     def close(self) -> None:
-        """Close the logs."""
+        """Close the logs, and let others write the folder."""
         for writer in (*self._lines.values(), *self._events.values()):
             writer.close()
+        self._lock.close()
+
+
+def _make(folder: pathlib.Path, config: dict[str, Any]) -> None:
+    try:
+        folder.mkdir(parents=True)
+        (folder / "metrics").mkdir()
+        _write_config(folder, config)
+    except FileExistsError:
+        raise UserError(f"{folder} exists already: choose another --out, or `beliefrl resume {folder}`.") from None
+    except OSError as error:
+        raise UserError(f"The run folder {folder} cannot be made ({error.strerror}): choose another --out.") from None
+
+
+def _write_config(folder: pathlib.Path, config: dict[str, Any]) -> None:
+    write_whole(folder / "config.json", (json.dumps(config, indent=2, default=str) + "\n").encode())
+
+
+def _locked(folder: pathlib.Path) -> Any:
+    """An open file that no other process can lock; the system lets go of it when this one ends, however it ends."""
+    try:
+        file = (folder / "lock").open("a+")
+    except OSError as error:
+        raise UserError(f"{folder} cannot be written ({error.strerror}): make it writable, or copy it.") from None
+    try:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except ImportError:  # not on this system
+        return file
+    except OSError:
+        file.seek(0)
+        who = file.read().strip() or "another"
+        file.close()
+        raise UserError(f"{folder} is being trained by process {who}: stop it, or wait until it has ended.") from None
+    file.truncate(0)
+    file.write(str(os.getpid()))
+    file.flush()
+    return file
 
 
 def _is_complete(config: Any) -> bool:
@@ -165,19 +228,9 @@ def _is_complete(config: Any) -> bool:
     return all(isinstance(config["options"].get(key), int) for key in ("seed", "seeds"))
 
 
-def write_whole(path: pathlib.Path, content: bytes) -> None:
-    """Write a file so that it is either the old one or the new one whole, whatever happens meanwhile."""
-    temporary = path.with_name(f".{path.name}.tmp")
-    with temporary.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
-
-
 def free_folder(name: str, parent: str = "runs") -> pathlib.Path:
-    """The first of runs/NAME-1, runs/NAME-2, ... that does not exist."""
-    number = 1
+    """The first of runs/NAME-1, runs/NAME-2, ... that does not exist; what no file is called becomes a dash."""
+    number, name = 1, re.sub(r"[^\w.-]+", "-", name)
     while (folder := pathlib.Path(parent) / f"{name}-{number}").exists():
         number += 1
     return folder

@@ -1,164 +1,40 @@
-"""Training from the first step to the last, on the host: which phase is called when, and what is logged.
+"""A training and what it leaves: its folder, log and checkpoints; how it is stopped, gone on with, and ended.
 
-The loop is Python over compiled stretches (`phases`); logs, progress and Ctrl-C live here, nothing is called back
-from inside a compiled function. `stages` yields what happens, `train` records it in a run's folder.
+`schedule.stages` does the training and yields what happens; everything here listens.
 """
 
 import dataclasses
 import os
-from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+import time
+from collections.abc import Callable
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from beliefrl import agents, host_loop, phases, runs, tasks
+from beliefrl import agents, runs, tasks
 from beliefrl.agents import Agent
 from beliefrl.analysis.curves import draw_curve
-from beliefrl.evaluation import MODES, MOST_EPISODES, summary
-from beliefrl.lockstep import PROCESSES
-from beliefrl.phases import Metrics, Program
+from beliefrl.checkpoint import Checkpoints
+from beliefrl.evaluation import MODES, agent_of, summary, task_of
+from beliefrl.phases import Seed
 from beliefrl.rollout import Episode
 from beliefrl.runs import Recorder, Run
+from beliefrl.schedule import Event, Options, Progress, Snapshot, capacity, stages
+from beliefrl.stop import Requests, Stopped
 from beliefrl.tasks import Task
-from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
-from beliefrl.types import UserError, check_choice, check_range
+from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.types import UserError
 
-
-@dataclasses.dataclass(frozen=True)
-class Options:
-    """How long, how often and how a training is evaluated."""
-
-    steps: int = 20_000
-    """Environment steps of each seed, rounded up to whole cycles of the agent."""
-    seeds: int = 1
-    """How many seeds are trained, side by side in one program."""
-    seed: int = 0
-    """Number of the first seed; the others follow it."""
-    eval_every: int = 2_000
-    """Environment steps between two evaluations (Appendix B)."""
-    eval_episodes: int = 5
-    """Episodes of each evaluation, with sampled actions and again with mode actions."""
-    replay_capacity: int = 1_000_000
-    """Most moments that a seed's replay keeps; the oldest make room."""
-    processes: str = "auto"
-    """Gymnasium environments: a process for each (always), for none (never), or where that pays (auto, from the command
-    line). A Python script that says always must begin under `if __name__ == "__main__":`."""
-
-    def __post_init__(self) -> None:
-        """Refuse impossible values with a UserError."""
-        check_range(self, ("steps", "eval_every", "replay_capacity"), 1)
-        check_range(self, ("eval_episodes",), 1, MOST_EPISODES)
-        check_range(self, ("seeds",), 1, 10_000)
-        check_range(self, ("seed",), 0, 2_000_000_000)
-        check_choice(self, "processes", PROCESSES)
-
-
-class Event(NamedTuple):
-    """What has just happened in a training; fields beyond the first three only where they apply."""
-
-    doing: str  # what comes next, in words
-    step: int  # environment steps of each seed so far
-    metrics: Metrics = {}  # leaves (seed,): means over the last stretch
-    episodes: Episode | None = None  # leaves (seed, stretch)
-    evaluation: Episode | None = None  # leaves (seed, mode, episodes)
-    states: Any = None  # the agents, where they are to be saved
-    part: tuple[int, int] | None = None  # of the pre-training: updates done, of how many
-
-
-def stages(agent: Agent, task: Task | GymnasiumTask, options: Options) -> Iterator[Event]:
-    """Train; yields an Event before whatever takes long and after whatever gave something to tell.
-
-    Raises:
-        Fault: of a Gymnasium environment, after an Event with what was learned until then.
-    """
-    numbers = range(options.seed, options.seed + options.seeds)
-    sizes = _capacity(agent, options), options.eval_episodes
-    if isinstance(task, GymnasiumTask):
-        program = host_loop.program(agent, task, *sizes, numbers, options.processes)
-    else:
-        program = phases.compile_program(agent, task, *sizes)
-    try:
-        yield from _stages(agent, program, options)
-    except Fault as fault:
-        if fault.seeds is not None:
-            metrics, episodes = fault.told or ({}, None)
-            yield Event("stopped by a fault", fault.step, metrics, episodes, states=fault.seeds.state)
-        raise
-    finally:
-        program.close()
-
-
-def _stages(agent: Agent, program: Program, options: Options) -> Iterator[Event]:
-    start = min(agent.step_start_rl, options.steps)
-    keys = jax.vmap(jax.random.key)(np.arange(options.seed, options.seed + options.seeds))
-    stretch = phases.stretch_length(agent)
-
-    yield Event("compiling the exploration", 0)
-    seeds, step, evaluated = program.begin(keys), 0, 0
-    while step < start:
-        steps = min(stretch, start - step, _until(step, options.eval_every))
-        seeds, told = program.explore(seeds, step, steps)
-        step += steps
-        yield Event("exploring", step, episodes=told.episodes)
-        if step % options.eval_every == 0:
-            yield from _evaluation(program, seeds, evaluated := step)
-
-    if step < options.steps and agent.pretrain_updates:
-        yield Event("compiling the pre-training", step)
-        for first in range(0, agent.pretrain_updates, stretch):
-            updates = min(stretch, agent.pretrain_updates - first)
-            seeds, metrics = program.pretrain(seeds, first, updates)
-            part = (first + updates, agent.pretrain_updates)
-            yield Event("pre-training", step, {f"pretrain_{name}": mean for name, mean in metrics.items()}, part=part)
-        seeds = program.relive(seeds)
-
-    if step < options.steps:
-        yield Event("compiling the learning", step)
-    while step < options.steps:
-        until = min(options.steps - step, _until(step, options.eval_every))
-        cycles = min(-(-until // agent.cycle), stretch // agent.cycle)
-        seeds, told = program.learn(seeds, step, cycles)
-        before, step = step, step + cycles * agent.cycle
-        yield Event("learning", step, told.metrics, told.episodes)
-        if step // options.eval_every > before // options.eval_every:
-            yield from _evaluation(program, seeds, evaluated := step)
-    if evaluated < step:
-        yield from _evaluation(program, seeds, step)
-
-
-def _capacity(agent: Agent, options: Options) -> int:
-    """Moments in a seed's replay: no more than can come, a moment a step and one more where an episode ends."""
-    if options.steps > agent.step_start_rl:
-        needed = max(2 * agent.step_start_rl, agent.window.length + 1)  # `relive` wants all of the exploration
-        if options.replay_capacity < needed:
-            raise UserError(
-                f"replay_capacity={options.replay_capacity} is too small: this agent needs at least {needed}."
-            )
-    return min(options.replay_capacity, 2 * options.steps)
-
-
-def _until(step: int, every: int) -> int:
-    """Steps to the next multiple of `every`."""
-    return every - step % every
-
-
-def _evaluation(program: Program, seeds: phases.Seed, step: int) -> Iterator[Event]:
-    yield Event("evaluating", step)
-    keys = jax.vmap(lambda key: jax.random.fold_in(jax.random.fold_in(key, phases.EVALUATE), step))(seeds.key)
-    try:
-        result = program.evaluate(seeds.state, keys)
-    except Fault as fault:
-        fault.seeds, fault.step = seeds, step
-        raise
-    yield Event("learning", step, evaluation=result, states=seeds.state)
+Report = Callable[[Event], None]
 
 
 def train(
     agent: Agent | str,
     task: Task | GymnasiumTask | str,
     out: str | os.PathLike[str] | None = None,
-    report: Callable[[Event], None] | None = None,
+    report: Report | None = None,
     **options: Any,
 ) -> Run:
     """Train an agent on a task and record it in a folder.
@@ -168,7 +44,8 @@ def train(
         task: a task, or the name of one.
         out: the run's folder, which must not exist; None is runs/AGENT-TASK-1, or the next free number.
         report: called with every Event as it happens, for progress.
-        options: the fields of `Options`: steps, seeds, seed, eval_every, eval_episodes, replay_capacity, processes.
+        options: the fields of `Options`: steps, seeds, seed, eval_every, eval_episodes, replay_capacity, processes,
+            checkpoint_steps, checkpoint_minutes, keep_checkpoints.
 
     Returns:
         The finished run: its results, its log, its files (`runs`).
@@ -176,6 +53,7 @@ def train(
     Raises:
         UserError: an unknown name or option, an impossible value, `out` exists, or a Gymnasium environment did what
             none may do; then what was learned and logged until that step is saved.
+        Stopped: Ctrl-C or SIGTERM, once a checkpoint is written; `resume` goes on. It is a KeyboardInterrupt.
     """
     agent = agents.make(agent) if isinstance(agent, str) else agent
     made: Any = tasks.make(task) if isinstance(task, str) else task
@@ -184,8 +62,7 @@ def train(
         if name not in known:
             raise UserError(f"Training has no option {name!r}: it has {', '.join(known)}.")
     chosen = Options(**options)
-    _capacity(agent, chosen)  # complains before there is a folder, as the next line does
-    spec = made.spec
+    _ = capacity(agent, chosen), made.spec  # complain before there is a folder
     config = {
         "agent": agents.name_of(agent),
         "hyperparameters": dataclasses.asdict(agent),  # pyright: ignore[reportArgumentType]
@@ -194,17 +71,116 @@ def train(
         **runs.provenance(),
     }
     recorder = Recorder(out or runs.free_folder(f"{config['agent']}-{config['task']}"), config)
-    results = None
+    return _Training(recorder, agent, made, chosen, report).run()
+
+
+def resume(
+    run: Run | str | os.PathLike[str],
+    steps: int | None = None,
+    task: Task | GymnasiumTask | None = None,
+    report: Report | None = None,
+) -> Run:
+    """Go on with a training from its last checkpoint, as if it had never stopped.
+
+    On the same machine the metrics and the networks are those of a training that was not interrupted, to the last bit;
+    on a Gymnasium environment the episode that was going on is not, since its state cannot be saved: a new one begins.
+
+    Args:
+        run: a run, or its folder.
+        steps: train for so many environment steps in all; None: as many as before. They may only grow.
+        task: needed only where the run was trained on a task of your own.
+        report: called with every Event as it happens, for progress.
+
+    Raises:
+        UserError: there is no such run, it has no good checkpoint, another process trains it, or `steps` are too few.
+        Stopped: Ctrl-C or SIGTERM, once a checkpoint is written.
+    """
+    folder = run.folder if isinstance(run, Run) else run
+    recorder = Recorder(folder, None)
     try:
-        for event in stages(agent, made, chosen):
-            results = _record(recorder, event, spec.has_success) or results
-            if report is not None:
-                report(event)
-    finally:
+        agent, made = agent_of(recorder), task_of(recorder) if task is None else task
+        before = recorder.config["options"]
+        if steps is not None and steps < before["steps"]:
+            raise UserError(f"steps={steps} is impossible: {folder} trains for {before['steps']}, and may only grow.")
+        options = Options(**before | {"steps": before["steps"] if steps is None else steps})
+        recorder.amend({"options": dataclasses.asdict(options)}, runs.provenance())
+    except BaseException:
         recorder.close()
-    recorder.finish(results or {})
-    draw_curve(recorder)
-    return recorder
+        raise
+    training = _Training(recorder, agent, made, options, report)
+    return training.run(training.restore)
+
+
+class _Training:
+    """One training as it is being recorded."""
+
+    def __init__(self, recorder: Recorder, agent: Agent, task: Any, options: Options, report: Report | None):
+        self.recorder, self.agent, self.task, self.options = recorder, agent, task, options
+        self.report = report or (lambda event: None)
+        self.has_success = task.spec.has_success
+        self.checkpoints = Checkpoints(recorder.folder, options.keep_checkpoints)
+        self.last, self.saved_at = Progress(), time.monotonic()
+        self.results = recorder.results()
+        self.requests = Requests()
+
+    def run(self, restore: Callable[[Seed], Snapshot] | None = None) -> Run:
+        """To the end, or until it is stopped."""
+        try:
+            with self.requests:
+                for event in stages(self.agent, self.task, self.options, restore):
+                    self._listen(event)
+            self.checkpoints.close()
+        finally:
+            self.checkpoints.abandon()
+            self.recorder.close()
+        self.recorder.finish(self.results or {})
+        draw_curve(self.recorder)
+        return self.recorder
+
+    def restore(self, shapes: Seed) -> Snapshot:
+        """From the last good checkpoint; the log is cut back to what it was then."""
+        ring = shapes.replay
+        like = shapes._replace(replay=ring._replace(moments=()))
+        found = self.checkpoints.restore(like, ring.moments)
+        for why in found.passed_over:
+            self.report(Event("resuming", found.step, note=f"{why} The checkpoint before it is used."))
+        self.recorder.rewind({int(seed): length for seed, length in found.progress["metrics"].items()})
+        self.last = Progress(*found.progress["progress"])
+        self.report(Event("resuming", found.step, note=f"goes on from the checkpoint of step {found.step:,}"))
+        if isinstance(self.task, GymnasiumTask):
+            self.report(Event("resuming", found.step, note="a new episode begins: an environment cannot be saved"))
+        seeds = found.tree._replace(replay=found.tree.replay._replace(moments=found.moments))
+        return Snapshot(self.last, jax.tree.map(jnp.asarray, seeds))
+
+    def _listen(self, event: Event) -> None:
+        self.results = _record(self.recorder, event, self.has_success) or self.results
+        self.report(event)
+        if event.snapshot is not None:
+            self._consider(event.snapshot)
+
+    def _consider(self, snapshot: Snapshot) -> None:
+        """Write a checkpoint if it is time for one; leave if that was asked for."""
+        progress, options = snapshot.progress, self.options
+        relived = progress.relived and not self.last.relived
+        if relived:
+            self.checkpoints.forget_moments()
+        steps = progress.step - self.last.step >= options.checkpoint_steps > 0
+        minutes = time.monotonic() - self.saved_at >= 60 * options.checkpoint_minutes > 0
+        ended = progress.step >= options.steps and progress.evaluated == progress.step
+        asked = self.requests.number
+        if relived or steps or minutes or ended or asked:
+            self._save(snapshot)
+        if asked and not ended:
+            self.checkpoints.wait()
+            folder = self.recorder.folder
+            raise Stopped(f"stopped at step {progress.step:,}; `beliefrl resume {folder}` goes on from there.", asked)
+
+    def _save(self, snapshot: Snapshot) -> None:
+        replay = snapshot.seeds.replay
+        rest = snapshot.seeds._replace(replay=replay._replace(moments=()))
+        progress = {"progress": list(snapshot.progress), "metrics": self.recorder.lengths()}
+        self.checkpoints.save(snapshot.progress.step, progress, rest, replay.moments, np.asarray(replay.added))
+        self.last, self.saved_at = snapshot.progress, time.monotonic()
 
 
 def _record(recorder: Recorder, event: Event, has_success: bool) -> dict[str, Any] | None:

@@ -1,0 +1,94 @@
+"""Trees of arrays as files of plain numbers (safetensors), and files that are there whole or not at all.
+
+An array is named by its place in the tree. Random keys are kept as their numbers. Nothing that is read can run code.
+"""
+
+import os
+import pathlib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import safetensors
+import safetensors.numpy
+
+from beliefrl.types import UserError
+
+
+class Damaged(UserError):
+    """A file is not what was written."""
+
+
+def copied(tree: Any) -> dict[str, np.ndarray]:
+    """Every array of a tree by its name, copied to the host."""
+    return {name: np.array(_numbers(leaf), order="C") for name, leaf in _named(tree)}
+
+
+def packed(arrays: dict[str, np.ndarray], about: dict[str, str] | None = None) -> bytes:
+    """The content of a file that holds these arrays."""
+    return safetensors.numpy.save(arrays, about)
+
+
+def read(path: pathlib.Path, like: Any) -> Any:
+    """A tree of the structure, shapes and types of `like`.
+
+    Raises:
+        Damaged: it cannot be read.
+        UserError: it holds something else.
+    """
+    saved = load(path)
+    leaves = []
+    for name, leaf in _named(like):
+        numbers = jax.eval_shape(_numbers, leaf)
+        found = saved.get(name)
+        if found is None or found.shape != numbers.shape or found.dtype != numbers.dtype:
+            raise UserError(f"{path} does not fit the agent in config.json (at {name}): they are not of one training.")
+        leaves.append(jax.random.wrap_key_data(jnp.asarray(found)) if _is_key(leaf) else found)
+    return jax.tree.unflatten(jax.tree.structure(like), leaves)
+
+
+def load(path: pathlib.Path) -> dict[str, np.ndarray]:
+    """The arrays of a file, by name.
+
+    Raises:
+        Damaged: it cannot be read.
+    """
+    try:
+        return safetensors.numpy.load_file(path)
+    except (OSError, safetensors.SafetensorError):
+        raise Damaged(f"{path} is damaged: restore it from a copy, or train again.") from None
+
+
+def _named(tree: Any) -> list[tuple[str, Any]]:
+    return [(jax.tree_util.keystr(where), leaf) for where, leaf in jax.tree_util.tree_leaves_with_path(tree)]
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _numbers(leaf: Any) -> Any:
+    return jax.random.key_data(leaf) if _is_key(leaf) else leaf
+
+
+def write_whole(path: pathlib.Path, content: bytes) -> None:
+    """Write a file so that it is either the old one or the new one whole, whatever happens meanwhile."""
+    temporary = path.with_name(f".{path.name}.tmp")
+    with temporary.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+    sync_folder(path.parent)
+
+
+def sync_folder(folder: pathlib.Path) -> None:
+    """Bring the names in a folder onto the disk."""
+    if os.name != "posix":
+        return
+    opened = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(opened)
+    finally:
+        os.close(opened)

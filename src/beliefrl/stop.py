@@ -1,0 +1,63 @@
+"""Ctrl-C and SIGTERM: the first is a request, the second leaves at once."""
+
+import os
+import signal
+import socket
+import threading
+from types import FrameType
+from typing import Any
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Stopped(KeyboardInterrupt):
+    """A training was left at somebody's request; its message says how to go on."""
+
+    def __init__(self, message: str, number: int):
+        super().__init__(message)
+        self.exit_code = 128 + number
+
+
+class Requests:
+    """While entered, the first signal is kept in `number`; a second one ends the program in that moment.
+
+    Python runs handlers between two of its own instructions, so one that comes while a compiled function runs waits
+    for it. The second is therefore watched for by a thread, which the system tells of each signal at once.
+    """
+
+    def __init__(self):
+        self.number: int | None = None
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> "Requests":
+        if threading.current_thread() is not threading.main_thread():
+            return self  # only there can signals be handled
+        self._ours, theirs = socket.socketpair()
+        theirs.setblocking(False)
+        self._theirs = theirs
+        threading.Thread(target=self._watch, args=(self._ours,), daemon=True).start()
+        self._fd = signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
+        for number in SIGNALS:
+            self._before[number] = signal.signal(number, self._handle)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if not self._before:
+            return
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        self._before = {}
+        signal.set_wakeup_fd(self._fd)
+        self._theirs.close()
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self.number is None:
+            self.number = number
+
+    def _watch(self, ours: socket.socket) -> None:
+        seen = 0
+        with ours:
+            while told := ours.recv(1):
+                seen += told[0] in SIGNALS
+                if seen > 1:
+                    os._exit(128 + told[0])
