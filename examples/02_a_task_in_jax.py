@@ -1,7 +1,7 @@
 """A task in pure JAX: it compiles together with the agent, so many seeds train in one program.
 
     pip install beliefrl
-    python examples/02_a_task_in_jax.py                  # 5,000 steps, four seeds: about ten minutes on two cores
+    python examples/02_a_task_in_jax.py                  # 4,000 steps, two seeds
     python examples/02_a_task_in_jax.py --steps 300      # to see it run
 
 A light shows for the first moment of an episode where a lamp stands, left or right; after a while in the dark one must
@@ -47,7 +47,7 @@ class Lamp:
         return jnp.array(False)
 
 
-def main(steps: int = 5_000, seeds: int = 4, agent: str = "sac-lstm", out: str = "runs/lamp") -> None:
+def main(steps: int = 4_000, seeds: int = 2, agent: str = "sac-lstm", out: str = "runs/lamp") -> None:
     """Train with memory, `seeds` seeds side by side."""
     task = Lamp()
     run = beliefrl.train(agent, task, out, steps=steps, seeds=seeds, eval_every=1_000, eval_episodes=20)

@@ -38,8 +38,8 @@ class StackAgent(SAC):
     """Observations that the controller reads."""
     batch_size: int = 256
     """Transitions in an update."""
-    pretrain_updates: int = 0
-    """Updates at step_start_rl."""
+    pretrain_updates: int = 5000
+    """Updates at step_start_rl, as many as the paper's agents make."""
 
     @property
     def cycle(self) -> int:

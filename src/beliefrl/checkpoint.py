@@ -13,7 +13,9 @@ one before it is used. Files are plain numbers and JSON: reading them runs no co
 
 import hashlib
 import json
+import os
 import pathlib
+import re
 import shutil
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -105,6 +107,16 @@ class Checkpoints:
         self.wait()
         self._thread.shutdown()
 
+    def keep_for(self, name: str) -> pathlib.Path | None:
+        """Keep the last checkpoint, whatever is written after it; returns where, or None where there is none."""
+        self.wait()
+        found = self._listed()
+        if not found:
+            return None
+        kept = self.folder / f"kept-for-{name}"
+        shutil.copytree(found[0], kept, copy_function=os.link, dirs_exist_ok=True)
+        return kept
+
     def abandon(self) -> None:
         """Take no more; what is being written is finished, what goes wrong in it concerns nobody any more."""
         self._thread.shutdown()
@@ -132,7 +144,8 @@ class Checkpoints:
             self._segments.append(Segment(path.name, start, stop, len(content), _sha256(content)))
         final = self.folder / f"{_next_number(self.folder):06d}-step-{step}"
         temporary = self.folder / f".{final.name}.tmp"
-        shutil.rmtree(temporary, ignore_errors=True)
+        for left in self.folder.glob(".*.tmp"):  # by a process that was killed
+            shutil.rmtree(left)
         temporary.mkdir()
         content = arrays.packed(state)
         write_whole(temporary / "state.safetensors", content)
@@ -149,6 +162,7 @@ class Checkpoints:
         kept = self._listed()[: self.keep]
         for path in self._listed()[self.keep :]:
             shutil.rmtree(path)
+        kept += self.folder.glob("kept-*")
         named = {segment["file"] for path in kept for segment in _content(path)["replay"]}
         for path in (self.folder / "replay").iterdir():
             if path.name not in named:
@@ -216,8 +230,9 @@ def listed(folder: pathlib.Path) -> list[pathlib.Path]:
 
 
 def _next_number(folder: pathlib.Path) -> int:
-    """One more than what any file here begins with, so that none is ever replaced."""
-    return max((int(path.name.removeprefix("damaged-")[:6]) for path in folder.glob(f"*{NUMBER}[-.]*")), default=0) + 1
+    """One more than any number of a file here, so that none is ever replaced."""
+    found = (re.search(r"\d{6}", path.name) for path in folder.iterdir())
+    return max((int(number[0]) for number in found if number), default=0) + 1
 
 
 def _on_host(leaf: Any) -> Any:

@@ -86,7 +86,8 @@ class TrainingDisplay:
         result = event.evaluation
         assert result is not None
         total, success = np.asarray(result.total), np.asarray(result.success)
-        means = f"return {total[:, 0].mean():.1f} sampled, {total[:, 1].mean():.1f} mode"
+        sampled, mode = np.nanmean(total, axis=(0, 2))  # without seeds that have diverged
+        means = f"return {sampled:.1f} sampled, {mode:.1f} mode"
         line = f"step {event.step:,}: {means}"
         if success.any():
             line += f"; success {success[:, 0].mean():.0%} sampled, {success[:, 1].mean():.0%} mode"
@@ -104,7 +105,8 @@ def results_table(results: dict[str, Any], seeds: list[int], title: str) -> Tabl
     for heading in ("seed", "sampled actions", "mode actions", *(["success sampled", "success mode"] * with_success)):
         table.add_column(heading, justify="right")
     for index, seed in enumerate(seeds):
-        cells = [f"{results[mode]['seeds'][index]:.1f}" for mode in ("sampled", "mode")]
+        returns = [results[mode]["seeds"][index] for mode in ("sampled", "mode")]
+        cells = ["diverged" if mean is None else f"{mean:.1f}" for mean in returns]
         if with_success:
             cells += [f"{results[mode]['seeds_success'][index]:.0%}" for mode in ("sampled", "mode")]
         table.add_row(str(seed), *cells)

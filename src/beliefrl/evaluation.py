@@ -30,10 +30,11 @@ def summary(result: Episode, has_success: bool) -> dict[str, Any]:
     table = {}
     for index, mode in enumerate(MODES):
         seeds = total[:, index].mean(axis=-1)
+        there = seeds[np.isfinite(seeds)]  # a seed that has diverged has no returns
         table[mode] = {
-            "mean": float(seeds.mean()),
-            "sem": float(seeds.std(ddof=1) / np.sqrt(seeds.size)) if seeds.size > 1 else None,
-            "seeds": [float(mean) for mean in seeds],
+            "mean": float(there.mean()),
+            "sem": float(there.std(ddof=1) / np.sqrt(there.size)) if there.size > 1 else None,
+            "seeds": [float(mean) if np.isfinite(mean) else None for mean in seeds],
             "success": float(success[:, index].mean()) if has_success else None,
             "seeds_success": [float(rate) for rate in success[:, index].mean(axis=-1)] if has_success else None,
         }

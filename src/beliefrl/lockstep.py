@@ -4,7 +4,9 @@ An episode ends where its lane says so and begins again when it is told to: the 
 """
 
 import contextlib
+import multiprocessing
 import os
+import signal
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -114,6 +116,8 @@ class _Factory:
         self.task, self.lane = task, lane
 
     def __call__(self) -> Environment:
+        if multiprocessing.parent_process() is not None:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is meant for the training, which ends us
         return self.task.environment(self.lane)
 
 

@@ -18,7 +18,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from datetime import UTC, datetime
 from importlib import metadata
 from typing import Any
@@ -166,9 +166,13 @@ class Recorder(Run):
         for writer in self._events.values():
             writer.flush()
 
-    def save(self, agents: Any) -> None:
-        """Save the agents of all seeds; the file appears whole or not at all."""
-        write_whole(self.folder / "agent.safetensors", arrays.packed(arrays.copied(agents)))
+    def save(self, agents: Any, but: Collection[int] = ()) -> None:
+        """Save the agents of all seeds but some, of which what was saved before stays; whole or not at all."""
+        path, saved = self.folder / "agent.safetensors", arrays.copied(agents)
+        before = arrays.load(path) if but and path.exists() else {}
+        for name, kept in before.items():
+            saved[name][sorted(but)] = kept[sorted(but)]
+        write_whole(path, arrays.packed(saved))
 
     def finish(self, results: Row) -> None:
         """Write the summary of the last evaluation and close the logs."""

@@ -6,12 +6,13 @@
 import dataclasses
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool
 
 from beliefrl import agents, runs, tasks
 from beliefrl.agents import Agent
@@ -121,6 +122,7 @@ class _Training:
         self.checkpoints = Checkpoints(recorder.folder, options.keep_checkpoints)
         self.last, self.saved_at = Progress(), time.monotonic()
         self.results = recorder.results()
+        self.lost: set[int] = set()  # indices of the seeds that have diverged
         self.requests = Requests()
 
     def run(self, restore: Callable[[Seed], Snapshot] | None = None) -> Run:
@@ -145,7 +147,7 @@ class _Training:
         for why in found.passed_over:
             self.report(Event("resuming", found.step, note=f"{why} The checkpoint before it is used."))
         self.recorder.rewind({int(seed): length for seed, length in found.progress["metrics"].items()})
-        self.last = Progress(*found.progress["progress"])
+        self.last, self.lost = Progress(*found.progress["progress"]), set(found.progress["lost"])
         self.report(Event("resuming", found.step, note=f"goes on from the checkpoint of step {found.step:,}"))
         if isinstance(self.task, GymnasiumTask):
             self.report(Event("resuming", found.step, note="a new episode begins: an environment cannot be saved"))
@@ -153,24 +155,58 @@ class _Training:
         return Snapshot(self.last, jax.tree.map(jnp.asarray, seeds))
 
     def _listen(self, event: Event) -> None:
-        self.results = _record(self.recorder, event, self.has_success) or self.results
+        self._look_for_divergence(event)
+        if event.evaluation is not None and self.lost:
+            event = event._replace(evaluation=_without(event.evaluation, self.lost))
+        self.results = _record(self.recorder, event, self.has_success, self.lost) or self.results
         self.report(event)
         if event.snapshot is not None:
             self._consider(event.snapshot)
 
-    def _consider(self, snapshot: Snapshot) -> None:
-        """Write a checkpoint if it is time for one; leave if that was asked for."""
+    def _look_for_divergence(self, event: Event) -> None:
+        """A seed whose losses or networks are not finite any more is lost; the others go on."""
+        for name, values in event.metrics.items():
+            self._lose(np.flatnonzero(~np.isfinite(values)), event, f"{name} is not finite")
+        states = event.states
+        if event.snapshot is not None and self._is_due(event.snapshot):
+            states = event.snapshot.seeds.state
+        if states is not None:
+            self._lose(np.flatnonzero(~np.asarray(_finite(states))), event, "its networks are not finite")
+
+    def _lose(self, indices: np.ndarray, event: Event, why: str) -> None:
+        for index in indices:
+            if index in self.lost:
+                continue
+            seed = self.recorder.seeds[index]
+            self.lost.add(int(index))
+            self.recorder.log(seed, "diverged", event.step, {"why": why})
+            kept = self.checkpoints.keep_for(f"seed-{seed}")
+            where = f"its last good checkpoint stays in {kept}" if kept else "it had no checkpoint yet"
+            note = f"seed {seed} diverged by step {event.step:,}: {why}; {where}."
+            if len(self.lost) == len(self.recorder.seeds):
+                raise UserError(f"All seeds have diverged; {note} Try smaller learning rates.")
+            self.report(Event(event.doing, event.step, note=note))
+
+    def _is_due(self, snapshot: Snapshot) -> bool:
+        """Whether it is time for a checkpoint."""
         progress, options = snapshot.progress, self.options
-        relived = progress.relived and not self.last.relived
-        if relived:
-            self.checkpoints.forget_moments()
         steps = progress.step - self.last.step >= options.checkpoint_steps > 0
         minutes = time.monotonic() - self.saved_at >= 60 * options.checkpoint_minutes > 0
-        ended = progress.step >= options.steps and progress.evaluated == progress.step
-        asked = self.requests.number
-        if relived or steps or minutes or ended or asked:
-            self._save(snapshot)
-        if asked and not ended:
+        relived = progress.relived and not self.last.relived
+        return bool(steps or minutes or relived or self._has_ended(progress) or self.requests.number)
+
+    def _has_ended(self, progress: Progress) -> bool:
+        return progress.step >= self.options.steps and progress.evaluated == progress.step
+
+    def _consider(self, snapshot: Snapshot) -> None:
+        """Write a checkpoint if it is time for one; leave if that was asked for."""
+        if not self._is_due(snapshot):
+            return
+        progress, asked = snapshot.progress, self.requests.number
+        if progress.relived and not self.last.relived:
+            self.checkpoints.forget_moments()
+        self._save(snapshot)
+        if asked and not self._has_ended(progress):
             self.checkpoints.wait()
             folder = self.recorder.folder
             raise Stopped(f"stopped at step {progress.step:,}; `beliefrl resume {folder}` goes on from there.", asked)
@@ -178,15 +214,36 @@ class _Training:
     def _save(self, snapshot: Snapshot) -> None:
         replay = snapshot.seeds.replay
         rest = snapshot.seeds._replace(replay=replay._replace(moments=()))
-        progress = {"progress": list(snapshot.progress), "metrics": self.recorder.lengths()}
+        lost = sorted(self.lost)
+        progress = {"progress": list(snapshot.progress), "metrics": self.recorder.lengths(), "lost": lost}
         self.checkpoints.save(snapshot.progress.step, progress, rest, replay.moments, np.asarray(replay.added))
         self.last, self.saved_at = snapshot.progress, time.monotonic()
 
 
-def _record(recorder: Recorder, event: Event, has_success: bool) -> dict[str, Any] | None:
-    """Log what an event tells of every seed; returns the summary of an evaluation."""
+@jax.jit
+def _finite(states: Any) -> Bool[Array, " seed"]:
+    """Whether all numbers of each seed's agent are finite."""
+    checks = [
+        jnp.all(jnp.isfinite(leaf), axis=tuple(range(1, leaf.ndim)))
+        for leaf in jax.tree.leaves(states)
+        if jnp.issubdtype(leaf.dtype, jnp.floating)
+    ]
+    return jnp.all(jnp.stack(checks), axis=0)
+
+
+def _without(evaluation: Episode, lost: Collection[int]) -> Episode:
+    """The same with no numbers of the seeds that are lost."""
+    total: Any = np.array(evaluation.total)
+    total[sorted(lost)] = np.nan
+    return evaluation._replace(total=total)
+
+
+def _record(recorder: Recorder, event: Event, has_success: bool, lost: Collection[int]) -> dict[str, Any] | None:
+    """Log what an event tells of every seed that is not lost; returns the summary of an evaluation."""
     metrics = {name: np.asarray(values) for name, values in event.metrics.items()}
     for index, seed in enumerate(recorder.seeds):
+        if index in lost:
+            continue
         if metrics and event.part:
             recorder.log(seed, "pretrain", event.part[0], {k: float(v[index]) for k, v in metrics.items()})
         elif metrics:
@@ -200,7 +257,7 @@ def _record(recorder: Recorder, event: Event, has_success: bool) -> dict[str, An
             recorder.log(seed, "evaluation", event.step, _evaluated(result, has_success))
     if event.states is not None:
         recorder.flush()
-        recorder.save(event.states)
+        recorder.save(event.states, lost)
     if event.evaluation is None:
         return None
     return {"step": event.step} | summary(event.evaluation, has_success)

@@ -11,17 +11,22 @@ COLOURS = {"sampled": "#1f6f8b", "mode": "#c8553d"}
 
 
 def evaluations(run: Run, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Steps (evaluation,), and of an entry each seed's means (seed, evaluation), as far as all seeds have come."""
+    """Steps (evaluation,), and of an entry each seed's means (seed, evaluation), as far as all seeds have come.
+
+    A seed that has diverged has NaN from there on.
+    """
     seeds = [{row["step"]: float(np.mean(row[name])) for row in run.rows(seed, "evaluation")} for seed in run.seeds]
-    steps = sorted(set.intersection(*map(set, seeds)))
-    return np.array(steps), np.array([[seed[step] for step in steps] for seed in seeds]).reshape(len(seeds), -1)
+    going = [means for means, seed in zip(seeds, run.seeds, strict=True) if not any(run.rows(seed, "diverged"))]
+    steps = sorted(set.intersection(*map(set, going or seeds)))
+    table = [[seed.get(step, np.nan) for step in steps] for seed in seeds]
+    return np.array(steps), np.array(table).reshape(len(seeds), -1)
 
 
 def standard_error(seeds: np.ndarray) -> np.ndarray:
-    """S.E.M. over the first axis; zeros where there is only one seed."""
-    if len(seeds) < 2:
-        return np.zeros(seeds.shape[1:])
-    return seeds.std(axis=0, ddof=1) / np.sqrt(len(seeds))
+    """S.E.M. over the first axis, of those that are not NaN; zeros where there is only one."""
+    count = np.sum(~np.isnan(seeds), axis=0)
+    squares = np.nansum((seeds - np.nanmean(seeds, axis=0)) ** 2, axis=0)
+    return np.where(count > 1, np.sqrt(squares / np.maximum(count - 1, 1) / np.maximum(count, 1)), 0.0)
 
 
 def draw_curve(run: Run, path: pathlib.Path | str | None = None) -> pathlib.Path:
@@ -36,11 +41,10 @@ def draw_curve(run: Run, path: pathlib.Path | str | None = None) -> pathlib.Path
     from matplotlib.figure import Figure
 
     path = pathlib.Path(path or run.folder / "curve.png")
-    rows = [list(run.rows(seed, "evaluation")) for seed in run.seeds]
-    if not all(rows):
+    if not evaluations(run, "sampled")[0].size:
         raise UserError(f"{run.folder} has no evaluation of every seed yet: there is no curve to draw.")
     panels = [("return", "")]
-    if "sampled_success" in rows[0][0]:
+    if any("sampled_success" in row for row in run.rows(run.seeds[0], "evaluation")):
         panels.append(("success rate", "_success"))
 
     figure = Figure(figsize=(5.6 * len(panels), 3.6), layout="constrained")
@@ -49,7 +53,7 @@ def draw_curve(run: Run, path: pathlib.Path | str | None = None) -> pathlib.Path
     for axis, (label, suffix) in zip(axes, panels, strict=True):
         for mode, colour in COLOURS.items():
             steps, seeds = evaluations(run, mode + suffix)
-            mean, error = seeds.mean(axis=0), standard_error(seeds)
+            mean, error = np.nanmean(seeds, axis=0), standard_error(seeds)
             for seed in seeds if len(seeds) > 1 else []:
                 axis.plot(steps, seed, color=colour, linewidth=0.6, alpha=0.4)
             axis.plot(steps, mean, color=colour, linewidth=2, label=f"{mode} actions", marker="o", markersize=3)

@@ -1,0 +1,272 @@
+"""A training that is stopped, killed or extended goes on as if nothing had happened; what cannot go on says why."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from beliefrl import agents, load, resume, train
+from beliefrl.analysis.curves import draw_curve, evaluations
+from beliefrl.arrays import load as load_arrays
+from beliefrl.checkpoint import listed
+from beliefrl.cli import main
+from beliefrl.runs import Recorder, Run
+from beliefrl.stop import Stopped
+from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.types import UserError
+from wrong import Fine
+
+SIZES = {"policy_layers": (8,), "value_layers": (8,), "batch_size": 8}
+AGENT = agents.make("sac-mlp", step_start_rl=20, pretrain_updates=150, **SIZES)
+OPTIONS = {"steps": 240, "seeds": 2, "eval_every": 120, "eval_episodes": 1, "checkpoint_steps": 1}
+
+
+class Crash(Exception):
+    """The machine dies."""
+
+
+def crash_at(number):
+    """A report that crashes at the event of that number."""
+    seen = []
+
+    def report(event):
+        seen.append(event)
+        if len(seen) == number:
+            raise Crash
+
+    return report
+
+
+def files(folder):
+    """The contents of what a run has learned and logged."""
+    paths = [*sorted((folder / "metrics").iterdir()), folder / "agent.safetensors", folder / "results.json"]
+    return {path.name: path.read_bytes() for path in paths}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A training that nothing happened to."""
+    folder = tmp_path_factory.mktemp("whole") / "run"
+    events = []
+    train(AGENT, "pendulum-v", folder, events.append, **OPTIONS)
+    return folder, len(events)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.55, pytest.param(0.8, marks=pytest.mark.slow), 0.99])
+def test_a_crashed_training_goes_on_to_the_last_bit(whole, tmp_path, share):
+    folder, events = whole
+    with pytest.raises(Crash):
+        train(AGENT, "pendulum-v", tmp_path / "run", crash_at(max(int(share * events), 5)), **OPTIONS)
+    assert listed(tmp_path / "run")
+    resume(tmp_path / "run")
+    assert files(tmp_path / "run") == files(folder)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["vrm", "sac-lstm", "slac"])
+def test_every_agent_goes_on_to_the_last_bit(tmp_path, name):
+    models = {"train_times_fivrm": 10, "d_size": 8, "z_size": 4, "hidden_size": 8}
+    sequences = {"seq_len": 8, "burn_in": 4, "batch_size": 2}
+    sizes = {
+        "vrm": models | sequences,
+        "sac-lstm": {"d_size": 8, "pretrain_updates": 10} | sequences,
+        "slac": {"z1_size": 2, "z2_size": 4, "model_layers": (8,), "batch_size": 2, "pretrain_updates": 10},
+    }
+    agent = agents.make(name, step_start_rl=20, policy_layers=(8,), value_layers=(8,), **sizes[name])
+    events = []
+    train(agent, "pendulum-p", tmp_path / "whole", events.append, **OPTIONS)
+    with pytest.raises(Crash):
+        train(agent, "pendulum-p", tmp_path / "run", crash_at(len(events) - 4), **OPTIONS)
+    resume(tmp_path / "run")
+    assert files(tmp_path / "run") == files(tmp_path / "whole")
+
+
+def test_a_finished_training_can_be_made_longer(whole, tmp_path):
+    folder, _ = whole
+    train(AGENT, "pendulum-v", tmp_path / "run", **OPTIONS | {"steps": 120})
+    run = resume(tmp_path / "run", steps=240)
+    assert files(run.folder) == files(folder)
+    assert run.config["options"]["steps"] == 240
+    assert len(run.config["resumed"]) == 1
+    with pytest.raises(UserError, match="steps=100 is impossible: .* trains for 240, and may only grow"):
+        resume(run, steps=100)
+
+
+def test_resuming_what_is_finished_changes_nothing(whole):
+    folder, _ = whole
+    before = files(folder)
+    resume(folder)
+    assert files(folder) == before
+
+
+def test_the_log_has_no_gap_and_no_row_twice(whole):
+    folder, _ = whole
+    steps = [row["step"] for row in Run(folder).rows(0, "update")]
+    assert steps == sorted(set(steps))
+    assert steps[-1] == 240
+
+
+def test_without_a_checkpoint_there_is_a_sentence(tmp_path):
+    with pytest.raises(Crash):
+        train(AGENT, "pendulum-v", tmp_path / "run", crash_at(1), **OPTIONS)
+    with pytest.raises(UserError, match="has no checkpoint to go on from"):
+        resume(tmp_path / "run")
+    with pytest.raises(UserError, match="There is no run folder"):
+        resume(tmp_path / "nowhere")
+
+
+def test_a_run_that_is_being_trained_is_not_touched(whole):
+    folder, _ = whole
+    recorder = Recorder(folder, None)
+    try:
+        with pytest.raises(UserError, match=f"is being trained by process {os.getpid()}: stop it"):
+            resume(folder)
+    finally:
+        recorder.close()
+    resume(folder)
+
+
+def test_a_log_that_was_cut_is_told(whole, tmp_path):
+    with pytest.raises(Crash):
+        train(AGENT, "pendulum-v", tmp_path / "run", crash_at(whole[1] - 2), **OPTIONS)
+    (tmp_path / "run" / "metrics" / "seed-1.jsonl").write_text("")
+    with pytest.raises(UserError, match=r"seed-1\.jsonl is shorter than when the checkpoint was written"):
+        resume(tmp_path / "run")
+
+
+def test_an_environment_goes_on_from_the_start_of_an_episode(tmp_path):
+    task, notes = GymnasiumTask(Fine, "fine"), []
+    with pytest.raises(Crash):
+        train(AGENT, task, tmp_path / "run", crash_at(12), **OPTIONS)
+    run = resume(tmp_path / "run", task=task, report=lambda event: notes.append(event.note))
+    assert any("a new episode begins" in note for note in notes if note)
+    assert [row["step"] for row in run.rows(0, "evaluation")] == [120, 240]
+    assert {row["length"] for row in run.rows(0, "episode")} == {10}
+
+
+def test_a_seed_that_diverges_stops_alone(tmp_path, monkeypatch):
+    """The second seed's networks are made NaN after step 120."""
+    from beliefrl import phases
+
+    real = phases.compile_program
+
+    def compiled(*args):
+        program = real(*args)
+
+        def learn(seeds, first, cycles):
+            seeds, told = program.learn(seeds, first, cycles)
+            if first >= 120:
+                alpha = seeds.state.controller.log_alpha.at[1].set(jnp.nan)
+                controller = seeds.state.controller._replace(log_alpha=alpha)
+                seeds = seeds._replace(state=seeds.state._replace(controller=controller))
+            return seeds, told
+
+        return program._replace(learn=learn)
+
+    monkeypatch.setattr(phases, "compile_program", compiled)
+    notes = []
+    run = train(AGENT, "pendulum-v", tmp_path / "run", lambda event: notes.append(event.note), **OPTIONS)
+    told = [note for note in notes if note]
+    assert len(told) == 1
+    assert told[0].startswith(
+        "seed 1 diverged by step 220: its networks are not finite; its last good checkpoint stays"
+    )
+    assert [row["step"] for row in run.rows(0, "evaluation")] == [120, 240]
+    assert [row["step"] for row in run.rows(1, "evaluation")] == [120]
+    assert run.results()["mode"]["seeds"][1] is None
+    assert run.results()["mode"]["mean"] == run.results()["mode"]["seeds"][0]
+    kept = load_arrays(run.folder / "checkpoints" / "kept-for-seed-1" / "state.safetensors")
+    assert all(np.isfinite(array).all() for array in kept.values())
+    assert np.isfinite(load(run, seed=1).predict(np.zeros(1))[0]).all()  # as it was at 120
+    steps, means = evaluations(run, "mode")
+    np.testing.assert_array_equal(np.isnan(means), [[False, False], [False, True]])
+    assert draw_curve(run).exists()
+    assert json.loads((run.folder / "results.json").read_text())
+
+
+def test_the_first_signal_is_a_checkpoint_and_a_word_how_to_go_on(whole, tmp_path):
+    folder, events = whole
+    seen = []
+
+    def report(event):
+        seen.append(event)
+        if len(seen) == events // 2:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    with pytest.raises(Stopped, match=r"stopped at step \d+; `beliefrl resume .*run` goes on from there") as stopped:
+        train(AGENT, "pendulum-v", tmp_path / "run", report, **OPTIONS | {"checkpoint_steps": 0})
+    assert stopped.value.exit_code == 143
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+    resume(tmp_path / "run")
+    assert files(tmp_path / "run") == files(folder)
+
+
+def test_trainings_in_other_threads_leave_signals_alone(tmp_path):
+    failed = []
+
+    def work():
+        try:
+            train(AGENT, "pendulum-v", tmp_path / "run", **OPTIONS | {"steps": 20})
+        except BaseException as error:
+            failed.append(error)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert not failed
+
+
+SLEEPER = """
+import time
+from beliefrl.stop import Requests
+with Requests():
+    print("ready", flush=True)
+    sum(range(10**11))  # one instruction of Python, as a compiled function is
+"""
+
+
+def test_a_second_signal_ends_the_program_at_once():
+    command = [sys.executable, "-c", "import signal; signal.signal(2, signal.default_int_handler)\n" + SLEEPER]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout.readline() == "ready\n"
+            process.send_signal(signal.SIGINT)
+            time.sleep(0.5)
+            assert process.poll() is None
+            process.send_signal(signal.SIGINT)
+            assert process.wait(timeout=20) == 130
+        finally:
+            process.kill()
+
+
+@pytest.mark.parametrize(
+    ("line", "phrase"),
+    [
+        ("resume", "run is missing"),
+        ("resume nowhere", "There is no run folder nowhere"),
+        ("resume {whole} --steps 10", "may only grow"),
+        ("resume {whole} --steps ten", "must be a whole number"),
+        ("train sac-mlp pendulum-v --out {whole}", "exists already: choose another --out, or `beliefrl resume"),
+        ("train sac-mlp pendulum-v --out {whole} --resume", "was trained with"),
+        ("train vrm pendulum-v --out {whole} --resume", "was trained with agent=sac-mlp, not vrm"),
+        ("train sac-mlp pendulum-v --checkpoint-steps -1", "checkpoint_steps=-1 is impossible"),
+        ("train sac-mlp pendulum-v --checkpoint-minutes nan", "checkpoint_minutes=nan is impossible"),
+        ("train sac-mlp pendulum-v --keep-checkpoints 0", "keep_checkpoints=0 is impossible"),
+    ],
+)
+def test_mistakes_are_sentences(whole, tmp_path, monkeypatch, capsys, line, phrase):
+    folder, _ = whole
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main(line.format(whole=folder).split())
+    err = capsys.readouterr().err
+    assert ended.value.code == 2
+    assert phrase in err
+    assert err.count("\n") == 1
