@@ -59,7 +59,9 @@ def whole(tmp_path_factory):
     return folder, len(events)
 
 
-@pytest.mark.parametrize("share", [0.3, 0.55, pytest.param(0.8, marks=pytest.mark.slow), 0.99])
+@pytest.mark.parametrize(
+    "share", [pytest.param(0.3, marks=pytest.mark.slow), 0.6, pytest.param(0.99, marks=pytest.mark.slow)]
+)
 def test_a_crashed_training_goes_on_to_the_last_bit(whole, tmp_path, share):
     folder, events = whole
     with pytest.raises(Crash):
@@ -95,7 +97,7 @@ def test_a_finished_training_can_be_made_longer(whole, tmp_path):
     assert files(run.folder) == files(folder)
     assert run.config["options"]["steps"] == 240
     assert len(run.config["resumed"]) == 1
-    with pytest.raises(UserError, match="steps=100 is impossible: .* trains for 240, and may only grow"):
+    with pytest.raises(UserError, match=r"steps=100 is impossible: .* trains for 240, and may only grow"):
         resume(run, steps=100)
 
 
@@ -185,7 +187,7 @@ def test_a_seed_that_diverges_stops_alone(tmp_path, monkeypatch):
     kept = load_arrays(run.folder / "checkpoints" / "kept-for-seed-1" / "state.safetensors")
     assert all(np.isfinite(array).all() for array in kept.values())
     assert np.isfinite(load(run, seed=1).predict(np.zeros(1))[0]).all()  # as it was at 120
-    steps, means = evaluations(run, "mode")
+    _, means = evaluations(run, "mode")
     np.testing.assert_array_equal(np.isnan(means), [[False, False], [False, True]])
     assert draw_curve(run).exists()
     assert json.loads((run.folder / "results.json").read_text())
@@ -224,11 +226,11 @@ def test_trainings_in_other_threads_leave_signals_alone(tmp_path):
 
 
 SLEEPER = """
-import time
+import hashlib
 from beliefrl.stop import Requests
 with Requests():
     print("ready", flush=True)
-    sum(range(10**11))  # one instruction of Python, as a compiled function is
+    hashlib.pbkdf2_hmac('sha256', b'', b'', 10**9)  # one instruction of Python, as a compiled function is
 """
 
 
@@ -249,10 +251,10 @@ def test_a_second_signal_ends_the_program_at_once():
 @pytest.mark.parametrize(
     ("line", "phrase"),
     [
-        ("resume", "run is missing"),
+        ("resume", "RUN is missing"),
         ("resume nowhere", "There is no run folder nowhere"),
         ("resume {whole} --steps 10", "may only grow"),
-        ("resume {whole} --steps ten", "must be a whole number"),
+        ("resume {whole} --steps ten", "--steps cannot be 'ten'"),
         ("train sac-mlp pendulum-v --out {whole}", "exists already: choose another --out, or `beliefrl resume"),
         ("train sac-mlp pendulum-v --out {whole} --resume", "was trained with"),
         ("train vrm pendulum-v --out {whole} --resume", "was trained with agent=sac-mlp, not vrm"),
