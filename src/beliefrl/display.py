@@ -1,5 +1,6 @@
 """What a training shows while it runs, and the tables at the end."""
 
+import dataclasses
 import time
 from typing import Any
 
@@ -8,6 +9,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
+from beliefrl.checkpoint import listed
+from beliefrl.runs import Run
 from beliefrl.schedule import Event
 
 
@@ -116,6 +119,39 @@ def results_table(results: dict[str, Any], seeds: list[int], title: str) -> Tabl
         cells += [f"{results[mode]['success']:.0%}" for mode in ("sampled", "mode")]
     table.add_row("mean ± S.E.M.", *cells)
     return table
+
+
+def run_table(run: Run, agent: Any) -> Table:
+    """What a run was made with, and how far it is."""
+    table = Table(title=str(run.folder), title_justify="left", show_header=False)
+    config, options = run.config, run.config["options"]
+    own = {field.name: field.default for field in dataclasses.fields(agent)}
+    changed = [f"{name}={value}" for name, value in config["hyperparameters"].items() if _differs(value, own.get(name))]
+    constants = [f"{name}={value}" for name, value in config["constants"].items()]
+    observed = [] if config.get("observe") is None else [f"observe={' '.join(map(str, config['observe']))}"]
+    steps = [max((row["step"] for row in run.rows(seed) if row["kind"] != "pretrain"), default=0) for seed in run.seeds]
+    table.add_row("agent", config["agent"])
+    table.add_row("settings", ", ".join(changed) or "the agent's defaults")
+    table.add_row("task", " ".join([config["task"], *constants, *observed]))
+    table.add_row("seeds", ", ".join(map(str, run.seeds)))
+    table.add_row("steps", f"{max(steps):,} of {options['steps']:,}")
+    for seed in run.seeds:
+        for row in run.rows(seed, "diverged"):
+            table.add_row("diverged", f"seed {seed} by step {row['step']:,}: {row['why']}")
+    table.add_row("checkpoints", ", ".join(path.name for path in listed(run.folder)) or "none")
+    for index, session in enumerate([config, *config.get("resumed", ())]):
+        began = f"{session.get('started', '?')} to {session.get('ended', '?')}, {session.get('device', '?')}"
+        versions = " ".join(f"{name} {version}" for name, version in session.get("versions", {}).items())
+        table.add_section()
+        table.add_row("resumed" if index else "started", began)
+        table.add_row("command", " ".join(session.get("command", ())))
+        table.add_row("commit", str(session.get("git_commit")))
+        table.add_row("versions", versions)
+    return table
+
+
+def _differs(value: Any, default: Any) -> bool:
+    return value != (list(default) if isinstance(default, tuple) else default)
 
 
 def scalability_table(results: dict[str, dict[str, Any]], obs: int, actions: int) -> Table:

@@ -121,6 +121,12 @@ class Recorder(Run):
     def _metrics(self, seed: int) -> pathlib.Path:
         return self.folder / "metrics" / f"seed-{seed}.jsonl"
 
+    def note_end(self) -> None:
+        """Write down when this process has ended with the run."""
+        session = self.config["resumed"][-1] if self.config.get("resumed") else self.config
+        session["ended"] = _now()
+        _write_config(self.folder, self.config)
+
     def amend(self, changes: dict[str, Any], session: dict[str, Any]) -> None:
         """Change the config, and add what goes on with the run to its `resumed`."""
         self.config |= changes
@@ -247,8 +253,12 @@ def provenance() -> dict[str, Any]:
         "device": str(jax.devices()[0].device_kind),
         "git_commit": _git_commit(),
         "command": [os.path.basename(sys.argv[0]), *sys.argv[1:]],
-        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "started": _now(),
     }
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def _git_commit() -> str | None:

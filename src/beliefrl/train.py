@@ -3,6 +3,7 @@
 `schedule.stages` does the training and yields what happens; everything here listens.
 """
 
+import contextlib
 import dataclasses
 import os
 import time
@@ -134,6 +135,8 @@ class _Training:
             self.checkpoints.close()
         finally:
             self.checkpoints.abandon()
+            with contextlib.suppress(OSError):  # a full disk has been told already
+                self.recorder.note_end()
             self.recorder.close()
         self.recorder.finish(self.results or {})
         draw_curve(self.recorder)
