@@ -2,14 +2,13 @@
 
 import contextlib
 import importlib.metadata
-import json
 import os
 
 import pytest
 
-from beliefrl import cli, tasks
+from beliefrl import cli
+from mistakes import MISTAKES, TRAIN, prepare
 
-TRAIN = "train vrm pendulum-v"
 AGENTS = {"vrm", "sac-mlp", "sac-lstm", "slac", "vrm-single", "vrm-first", "vrm-keep", "vrm-deterministic"}
 TASKS = {"pendulum", "pendulum-v", "pendulum-p", "cartpole", "cartpole-v", "cartpole-p", "target-reaching"}
 ROBOTS = {name + mask for name in ("hopper", "walker2d", "ant", "halfcheetah") for mask in ("", "-v", "-p")}
@@ -47,89 +46,10 @@ def test_version(capsys):
     assert printed(capsys, "--version").strip() == importlib.metadata.version("beliefrl")
 
 
-MISTAKES = {
-    "trian": "did you mean train?",
-    "frobnicate": "no command 'frobnicate'",
-    "train": "No agent is named",
-    "train vmr pendulum-v": "no agent 'vmr': did you mean vrm?",
-    "train vrm": "TASK is missing",
-    "train vrm pendulm-v": "no task 'pendulm-v': did you mean pendulum-v?",
-    f"{TRAIN} extra": "one argument too many, 'extra'",
-    f"{TRAIN} --setps 5": "no option --setps: did you mean --steps?",
-    f"{TRAIN} --gama=2": "did you mean --gamma?",
-    f"{TRAIN} --steps": "--steps needs a value",
-    f"{TRAIN} --steps many": "--steps must be a whole number, not 'many'",
-    f"{TRAIN} --steps 1.5": "--steps must be a whole number, not '1.5'",
-    f"{TRAIN} --steps -5": "steps=-5 is impossible",
-    f"{TRAIN} --steps 99999999999999999999": "steps=99999999999999999999 is impossible",
-    f"{TRAIN} --seeds 0": "seeds=0 is impossible: it must be a whole number from 1",
-    f"{TRAIN} --seeds 99999999999": "seeds=99999999999 is impossible",
-    f"{TRAIN} --seed -1": "seed=-1 is impossible",
-    f"{TRAIN} --seed 2147483647 --seeds 5": "seed=2147483647 is impossible",
-    f"{TRAIN} --eval-every 0": "eval_every=0 is impossible",
-    f"{TRAIN} --eval-episodes -2": "eval_episodes=-2 is impossible",
-    f"{TRAIN} --gamma 2": "gamma=2.0 is impossible: it must be a number from 0 to 1",
-    f"{TRAIN} --gamma x": "--gamma must be a number, not 'x'",
-    f"{TRAIN} --tau -1": "tau=-1.0 is impossible",
-    f"{TRAIN} --seq-len 0": "seq_len=0 is impossible: it must be a whole number of at least 1",
-    f"{TRAIN} --batch-size 0": "batch_size=0 is impossible",
-    f"{TRAIN} --d-size 99999999999": "d_size=99999999999 is impossible",
-    f"{TRAIN} --lr-actor nan": "lr_actor=nan is impossible",
-    f"{TRAIN} --lr-actor -1": "lr_actor=-1.0 is impossible",
-    f"{TRAIN} --actor-regulariser inf": "actor_regulariser=inf is impossible",
-    f"{TRAIN} --policy-layers 0": "policy_layers=(0,) is impossible",
-    f"{TRAIN} --policy-layers": "policy_layers=() is impossible",
-    "train slac pendulum-v --history 0": "history=0 is impossible",
-    "train sac-lstm pendulum-v --burn-in -1": "burn_in=-1 is impossible",
-    "train sac-mlp pendulum-v --seq-len 4": "There is no option --seq-len",
-    f"{TRAIN} --models three": "--models must be one of 'both', 'single', 'first', 'keep', not 'three'",
-    f"{TRAIN} --elbo-scaling foo": "--elbo-scaling must be one of 'mean', 'sum', not 'foo'",
-    f"{TRAIN} --train-interval-rl 3": "train_interval_klvrm=5 is not a multiple of train_interval_rl=3",
-    f"{TRAIN} --replay-capacity 10": "replay_capacity=10 is too small: this agent needs at least 2000",
-    f"{TRAIN} --out there": "there exists already",
-    f"{TRAIN} --out there/file/run": "there/file/run cannot be made",
-    "evaluate": "RUN is missing",
-    "evaluate missing": "no run folder missing",
-    "evaluate there": "there is not a run",
-    "evaluate broken": "broken/config.json cannot be read",
-    "evaluate empty": "empty/config.json lacks",
-    "evaluate untrained": "untrained has no trained agent yet",
-    "evaluate damaged": "damaged/agent.safetensors is damaged",
-    "evaluate foreign": "no agent 'foreign'",
-    "evaluate untrained --episodes 0": "episodes=0 is impossible",
-    "evaluate untrained --episodes 999999999999": "episodes=999999999999 is impossible",
-    "evaluate untrained --seed -1": "seed=-1 is impossible",
-    "evaluate untrained --episdes 2": "did you mean --episodes?",
-    "export": "RUN is missing",
-    "export missing policy.jax": "no run folder missing",
-    "export untrained policy.jax": "untrained has no trained agent yet",
-    "export untrained policy.jax --seed 3": "untrained has no seed 3: it has 0",
-    "tasks all": "one argument too many, 'all'",
-    "bench": "No agent is named",
-    "bench vrm --obs 0": "obs_dim=0 is impossible",
-    "bench vrm --actions -1": "action_dim=-1 is impossible",
-    "bench vrm --seeds 0": "seeds=0 is impossible",
-}
-
-
 @pytest.fixture
 def folders(tmp_path, monkeypatch):
     """A working directory with runs that have something wrong with them, where no training can begin."""
-    config = {
-        "agent": "vrm",
-        "hyperparameters": {"d_size": 4},
-        **tasks.describe(tasks.make("pendulum-v")),
-        "options": {"seed": 0, "seeds": 1},
-    }
-    foreign = json.dumps(config | {"agent": "foreign"})
-    config = json.dumps(config)
-    contents = {"broken": config[:50], "empty": "{}", "untrained": config, "damaged": config, "foreign": foreign}
-    for name, content in contents.items():
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "config.json").write_text(content)
-    (tmp_path / "damaged" / "agent.safetensors").write_bytes(b"nonsense")
-    (tmp_path / "there").mkdir()
-    (tmp_path / "there" / "file").write_text("keep me")
+    prepare(tmp_path)
 
     def begin(*_, **__):
         raise AssertionError("The mistake was not noticed.")
@@ -158,6 +78,10 @@ def test_a_mistake_ends_with_one_sentence(folders, capsys, line):
     assert MISTAKES[line] in complaint(capsys, line.split())
     assert sorted(folders.rglob("*")) == before
     assert (folders / "there" / "file").read_text() == "keep me"
+
+
+def test_there_are_a_hundred_of_them():
+    assert len(MISTAKES) >= 100
 
 
 @pytest.mark.parametrize("argv", [[""], ["train", ""], ["train", "vrm", ""], ["evaluate", ""], ["evaluate", "a\nb"]])

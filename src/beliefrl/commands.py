@@ -186,8 +186,9 @@ def show(argv: Sequence[str]) -> None:
     from beliefrl.runs import Run
 
     run, console = Run(options.run), Console()
-    console.print(run_table(run, agent_of(run)))
-    if results := run.results():
+    table, results = run_table(run, agent_of(run)), run.results()
+    console.print(table)
+    if results:
         console.print(results_table(results, run.seeds, f"after {results['step']:,} steps"))
 
 

@@ -65,21 +65,29 @@ class Run:
         return list(range(first, first + count))
 
     def rows(self, seed: int, kind: str | None = None) -> Iterator[Row]:
-        """The log of a seed in the order it was written; of one kind, if given."""
+        """The log of a seed in the order it was written; of one kind, if given.
+
+        Raises:
+            UserError: a line is not what a training writes.
+        """
         path = self.folder / "metrics" / f"seed-{seed}.jsonl"
         if not path.exists():
             return
-        with path.open() as lines:
-            for line in lines:
+        with path.open(errors="replace") as lines:
+            for number, line in enumerate(lines, 1):
                 if line.endswith("\n"):
-                    row = json.loads(line)
+                    row = _parsed(line, f"Line {number} of {path}", ("step", "kind"))
                     if kind in (None, row["kind"]):
                         yield row
 
     def results(self) -> Row | None:
-        """The summary of the last evaluation; None before there was one."""
+        """The summary of the last evaluation; None before there was one.
+
+        Raises:
+            UserError: it is not what a training writes.
+        """
         path = self.folder / "results.json"
-        return json.loads(path.read_text()) if path.exists() else None
+        return _parsed(path.read_text(errors="replace"), str(path), ()) if path.exists() else None
 
     def load(self, like: Any) -> Any:
         """The saved agents, in a tree of the structure, shapes and types of `like`.
@@ -181,15 +189,25 @@ class Recorder(Run):
         write_whole(path, arrays.packed(saved))
 
     def finish(self, results: Row) -> None:
-        """Write the summary of the last evaluation and close the logs."""
+        """Write the summary of the last evaluation."""
         write_whole(self.folder / "results.json", (json.dumps(results, indent=2) + "\n").encode())
-        self.close()
 
     def close(self) -> None:
         """Close the logs, and let others write the folder."""
         for writer in (*self._lines.values(), *self._events.values()):
             writer.close()
         self._lock.close()
+
+
+def _parsed(text: str, what: str, keys: tuple[str, ...]) -> Row:
+    """An object of JSON with these keys; an empty one will do."""
+    try:
+        row = json.loads(text)
+    except ValueError:
+        row = None
+    if not isinstance(row, dict) or (row and not all(key in row for key in keys)):
+        raise UserError(f"{what} is damaged: restore it from a copy, or remove it.")
+    return row
 
 
 def _make(folder: pathlib.Path, config: dict[str, Any]) -> None:

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool
 from beliefrl import agents, runs, tasks
 from beliefrl.agents import Agent
 from beliefrl.analysis.curves import draw_curve
-from beliefrl.checkpoint import Checkpoints
+from beliefrl.checkpoint import Checkpoints, listed
 from beliefrl.evaluation import MODES, agent_of, summary, task_of
 from beliefrl.phases import Seed
 from beliefrl.rollout import Episode
@@ -97,20 +97,31 @@ def resume(
         UserError: there is no such run, it has no good checkpoint, another process trains it, or `steps` are too few.
         Stopped: Ctrl-C or SIGTERM, once a checkpoint is written.
     """
-    folder = run.folder if isinstance(run, Run) else run
+    folder = (run if isinstance(run, Run) else Run(run)).folder
+    if not listed(folder):
+        raise UserError(f"{folder} has no checkpoint to go on from: train again.")
     recorder = Recorder(folder, None)
     try:
         agent, made = agent_of(recorder), task_of(recorder) if task is None else task
-        before = recorder.config["options"]
+        before = _options(recorder)
         if steps is not None and steps < before["steps"]:
             raise UserError(f"steps={steps} is impossible: {folder} trains for {before['steps']}, and may only grow.")
-        options = Options(**before | {"steps": before["steps"] if steps is None else steps})
+        options = dataclasses.replace(Options(**before), **({} if steps is None else {"steps": steps}))
         recorder.amend({"options": dataclasses.asdict(options)}, runs.provenance())
     except BaseException:
         recorder.close()
         raise
     training = _Training(recorder, agent, made, options, report)
     return training.run(training.restore)
+
+
+def _options(run: Run) -> dict[str, Any]:
+    """With which a run was trained."""
+    known = {field.name for field in dataclasses.fields(Options)}
+    for name in run.config["options"]:
+        if name not in known:
+            raise UserError(f"{run.folder} was trained by another version: this one has no option {name!r}.")
+    return {"steps": Options.steps} | run.config["options"]
 
 
 class _Training:
@@ -133,13 +144,20 @@ class _Training:
                 for event in stages(self.agent, self.task, self.options, restore):
                     self._listen(event)
             self.checkpoints.close()
+            self.recorder.finish(self.results or {})
+            draw_curve(self.recorder)
+        except BrokenPipeError:  # whoever was reading the reports has gone
+            raise
+        except OSError as error:
+            raise UserError(
+                f"{self.recorder.folder} cannot be written ({error.strerror}): mend that, then "
+                f"`beliefrl resume {self.recorder.folder}` goes on from its last checkpoint."
+            ) from None
         finally:
             self.checkpoints.abandon()
             with contextlib.suppress(OSError):  # a full disk has been told already
                 self.recorder.note_end()
             self.recorder.close()
-        self.recorder.finish(self.results or {})
-        draw_curve(self.recorder)
         return self.recorder
 
     def restore(self, shapes: Seed) -> Snapshot:
