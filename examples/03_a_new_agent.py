@@ -4,6 +4,8 @@
     python examples/03_a_new_agent.py                  # 6,000 steps on the pendulum without its speed: a few minutes
     python examples/03_a_new_agent.py --steps 300      # to see it run
 
+By then two seeds came to -750 and -495; random play gets about -1200.
+
 An agent is a frozen dataclass of hyperparameters whose methods are pure functions, for one seed and one actor; the
 training loop maps them over seeds and environments. `SAC` brings Table 1 of the paper and the controller; what is left
 to say is what it remembers while acting, which windows of the past it learns from, and how a belief is formed of both.
