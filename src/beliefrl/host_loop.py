@@ -1,16 +1,17 @@
 """Algorithm 1 where the environments run on the host: the phases of `phases`, with Gymnasium's environments in them.
 
-The agent acts, records and learns by the same functions as in the compiled loop; only the step of the task is outside:
+The agent acts, records and learns by the same functions as in the compiled loop; only the step of the task is outside.
+A call of a compiled function costs as much as acting does, so there is one for every step of the environments:
 
-    act       compiled: the action of every seed
-    step      the environments, in lockstep
-    record    compiled: the moments go into the replays
-    ...       and when the steps of a cycle are done
-    learn     compiled: `phases.learn_cycle`
+    act             the first action of a stretch of steps
+    environments    a step, in lockstep
+    go on           record what they answered; when a cycle's steps are done, learn (`phases.learn_cycle`); act again
 
 A fault of an environment ends the training with what was learned and recorded until then.
 """
 
+import ctypes
+import sys
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -24,8 +25,7 @@ from beliefrl import phases, rollout
 from beliefrl.agents import Agent
 from beliefrl.lockstep import Lockstep
 from beliefrl.phases import ACT, REVIVE, Metrics, Program, Seed, Stretch, step_key
-from beliefrl.replay import Replay
-from beliefrl.rollout import Actor, Episode
+from beliefrl.rollout import Episode
 from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
 from beliefrl.types import Spec, Step
 
@@ -34,6 +34,7 @@ def program(
     agent: Agent, task: GymnasiumTask, capacity: int, episodes: int, seeds: Sequence[int], processes: str
 ) -> Program:
     """The phases of training with environments of their own for each of `seeds`."""
+    _keep_memory()
     loop = HostLoop(agent, task, capacity, seeds, processes)
     evaluation = Evaluation(agent, task, seeds, processes)
 
@@ -54,16 +55,37 @@ def program(
     )
 
 
+def _keep_memory() -> None:
+    """Let the C library keep freed memory for the next call.
+
+    A compiled function takes its scratch memory anew at every call, and where that is large the C library gives it back
+    to the system each time: 10 ms of VRM's updates of a cycle were the system clearing pages again.
+    """
+    if sys.platform == "linux":
+        mmap_threshold, trim_threshold, most = -3, -1, 2**31 - 1
+        libc = ctypes.CDLL(None)
+        if hasattr(libc, "mallopt"):  # glibc's
+            libc.mallopt(mmap_threshold, most)
+            libc.mallopt(trim_threshold, most)
+
+
+class Deed(NamedTuple):
+    """What the agent does at the moment in hand."""
+
+    action: Float[Array, "*seed action"]
+    memory: Any  # once it has perceived that moment
+
+
 class Answer(NamedTuple):
     """What the agent did, and what its environment answered."""
 
-    memory: Any
-    action: Float[Array, "*seed action"]
-    obs: Float[Array, "*seed obs"]
-    reward: Float[Array, "*seed"]
-    terminated: Bool[Array, "*seed"]
-    done: Bool[Array, "*seed"]
-    fresh: Float[Array, "*seed obs"]  # the first observation of the next episode, where done
+    deed: Deed
+    obs: Any  # (seed, obs)
+    reward: Any  # (seed,)
+    terminated: Any  # (seed,)
+    done: Any  # (seed,)
+    success: Any  # (seed,)
+    fresh: Any  # (seed, obs), the first observation of the next episode, where done
 
 
 class HostLoop:
@@ -75,10 +97,10 @@ class HostLoop:
         self.environments = Lockstep(task, [f"seed {seed}" for seed in seeds], processes)
         self._begin = jax.jit(jax.vmap(partial(_begin, agent, task.spec, capacity)))
         self._first = jax.jit(jax.vmap(lambda obs: rollout.first(agent, task.spec, (), obs)))
-        self._act = jax.jit(jax.vmap(partial(_act, agent), in_axes=(0, 0, 0, None)))
-        record = jax.vmap(partial(_record, agent, task.spec), in_axes=(0, 0, 0, 0, None, 0))
-        self._record = jax.jit(record, donate_argnums=1)
-        self._learn = jax.jit(jax.vmap(partial(phases.learn_cycle, agent), in_axes=(0, None)))
+        self._act = jax.jit(jax.vmap(partial(_act, agent), in_axes=(0, None)))
+        go_on, learn = partial(_go_on, agent, task.spec), partial(_learn, agent, task.spec)
+        self._go_on = jax.jit(jax.vmap(go_on, in_axes=(0, 0, 0, None)), donate_argnums=1)
+        self._learn = jax.jit(jax.vmap(learn, in_axes=(0, 0, None)), donate_argnums=0)
 
     def begin(self, keys: Key[Array, " seed"]) -> Seed:
         """Seeds before their first steps."""
@@ -96,52 +118,52 @@ class HostLoop:
 
     def explore(self, seeds: Seed, first: int, steps: int) -> tuple[Seed, Stretch]:
         """Environment steps without updates."""
-        told = _Told()
+        told, deed, networks = _Told(), self._act(seeds, first), _networks(seeds.state)
         for step in range(first, first + steps):
-            seeds = self._step(seeds, step, told)
+            answer = self._step(seeds, deed, step, told)
+            rest, deed, episode = self._go_on(networks, seeds._replace(state=()), answer, step)
+            seeds = rest._replace(state=seeds.state)
+            told.episodes.append(episode)
         return seeds, told.stretch()
 
     def learn(self, seeds: Seed, first: int, cycles: int) -> tuple[Seed, Stretch]:
         """`cycles` cycles of steps and updates from environment step `first` on."""
-        told = _Told()
-        for begins in range(first, first + cycles * self.agent.cycle, self.agent.cycle):
-            for step in range(begins, begins + self.agent.cycle):
-                seeds = self._step(seeds, step, told)
-            state, metrics = self._learn(seeds, begins)
-            seeds = seeds._replace(state=state)
-            told.metrics.append(metrics)
+        told, deed, cycle = _Told(), self._act(seeds, first), self.agent.cycle
+        for step in range(first, first + cycles * cycle):
+            answer = self._step(seeds, deed, step, told)
+            if (step + 1 - first) % cycle:
+                rest, deed, episode = self._go_on(_networks(seeds.state), seeds._replace(state=()), answer, step)
+                seeds = rest._replace(state=seeds.state)
+            else:
+                seeds, deed, episode, metrics = self._learn(seeds, answer, step)
+                told.metrics.append(metrics)
+            told.episodes.append(episode)
         return seeds, told.stretch()
 
-    def _step(self, seeds: Seed, step: int, told: "_Told") -> Seed:
-        """One environment step of every seed, recorded."""
-        action, memory = self._act(seeds.state, seeds.actor, seeds.key, step)
+    def _step(self, seeds: Seed, deed: "Deed", step: int, told: "_Told") -> "Answer":
+        """One step of every environment."""
         try:
-            obs, reward, terminated, truncated, success = self.environments.step(np.asarray(action))
+            obs, reward, terminated, truncated, success = self.environments.step(np.asarray(deed.action))
             done = terminated | truncated
             fresh = self.environments.restart(done) if done.any() else obs
         except Fault as fault:
             fault.seeds, fault.step, fault.told = seeds, step, told.stretch()
             raise
-        answer = Answer(memory, action, obs, reward, terminated, done, fresh)
-        result = self._record(seeds.state, seeds.replay, seeds.actor, seeds.key, step, answer)
-        actor, replay, total, length = result
-        told.episodes.append((done, total, length, success))
-        return seeds._replace(actor=actor, replay=replay)
+        return Answer(deed, obs, reward, terminated, done, success, fresh)
 
 
 class _Told:
     """What a stretch tells, gathered on the way."""
 
     def __init__(self):
-        self.metrics: list[Metrics] = []
-        self.episodes: list[tuple[Any, ...]] = []  # one a step: done, total, length, success of every seed
+        self.metrics: list[Metrics] = []  # of every cycle
+        self.episodes: list[Episode] = []  # one a step, leaves (seed,)
 
     def stretch(self) -> Stretch:
         """Means over its updates; episodes with leaves (seed, step)."""
-        metrics, columns = jax.device_get((self.metrics, list(zip(*self.episodes, strict=True))))
-        means = {name: np.mean([each[name] for each in metrics], axis=0) for name in (metrics[0] if metrics else {})}
-        episodes: Any = [np.stack(column, axis=1) for column in columns]
-        return Stretch(means, Episode(*episodes) if columns else None)
+        metrics, episodes = jax.device_get((self.metrics, self.episodes))
+        means = jax.tree.map(lambda *each: np.mean(each, axis=0), *metrics) if metrics else {}
+        return Stretch(means, jax.tree.map(lambda *each: np.stack(each, axis=1), *episodes) if episodes else None)
 
 
 def environment_seeds(keys: Key[Array, "*lane"]) -> Int[np.ndarray, "*lane"]:
@@ -156,29 +178,44 @@ def _begin(agent: Agent, spec: Spec, capacity: int, key: Key[Array, ""], obs: Fl
     return phases.seed_of(agent, spec, capacity, rollout.first(agent, spec, (), obs), key_state, key)
 
 
-def _act(
-    agent: Agent, state: Any, actor: Actor, key: Key[Array, ""], step: Int[Array, ""]
-) -> tuple[Float[Array, " action"], Any]:
-    key_move, _, _ = jax.random.split(step_key(key, step, ACT), 3)
-    return rollout.act(agent, state, actor, key_move, jnp.array(True))
+def _act(agent: Agent, seed: Seed, step: Int[Array, ""]) -> Deed:
+    key_move, _, _ = jax.random.split(step_key(seed.key, step, ACT), 3)
+    return Deed(*rollout.act(agent, seed.state, seed.actor, key_move, jnp.array(True)))
 
 
-def _record(
-    agent: Agent,
-    spec: Spec,
-    state: Any,
-    replay: Replay,
-    actor: Actor,
-    key: Key[Array, ""],
-    step: Int[Array, ""],
-    answer: Answer,
-) -> tuple[Actor, Replay, Float[Array, ""], Int[Array, ""]]:
-    """Record what the environment answered; the last two results are of the episode until then."""
-    _, key_last, _ = jax.random.split(step_key(key, step, ACT), 3)
-    after = rollout.arrive(actor, answer.memory, answer.action, (), answer.obs, answer.reward, answer.terminated)
-    begun = rollout.first(agent, spec, (), answer.fresh)
-    actor, replay = rollout.record(agent, state, replay, actor, after, begun, answer.done, key_last)
-    return actor, replay, after.total, after.length
+def _record(agent: Agent, spec: Spec, seed: Seed, answer: Answer, step: Int[Array, ""]) -> tuple[Seed, Episode]:
+    """Record what the environment answered at this step."""
+    _, key_last, _ = jax.random.split(step_key(seed.key, step, ACT), 3)
+    action, memory = answer.deed
+    after = rollout.arrive(seed.actor, memory, action, (), answer.obs, answer.reward, answer.terminated)
+    fresh = rollout.first(agent, spec, (), answer.fresh)
+    actor, replay = rollout.record(agent, seed.state, seed.replay, seed.actor, after, fresh, answer.done, key_last)
+    episode = Episode(answer.done, after.total, after.length, answer.success)
+    return seed._replace(actor=actor, replay=replay), episode
+
+
+def _networks(state: Any) -> Any:
+    """What of an agent's state acting needs: not the optimisers, hundreds of arrays that a call would look at."""
+    idle = [name for name in getattr(state, "_fields", ()) if "optimiser" in name]
+    return state._replace(**dict.fromkeys(idle, ())) if idle else state
+
+
+def _go_on(
+    agent: Agent, spec: Spec, networks: Any, rest: Seed, answer: Answer, step: Int[Array, ""]
+) -> tuple[Seed, Deed, Episode]:
+    """Record, and act again."""
+    seed, episode = _record(agent, spec, rest._replace(state=networks), answer, step)
+    return seed._replace(state=()), _act(agent, seed, step + 1), episode
+
+
+def _learn(
+    agent: Agent, spec: Spec, seed: Seed, answer: Answer, step: Int[Array, ""]
+) -> tuple[Seed, Deed, Episode, Metrics]:
+    """Record the last step of a cycle, learn, and act again."""
+    seed, episode = _record(agent, spec, seed, answer, step)
+    state, metrics = phases.learn_cycle(agent, seed, step + 1 - agent.cycle)
+    seed = seed._replace(state=state)
+    return seed, _act(agent, seed, step + 1), episode, metrics
 
 
 class Evaluation:
@@ -202,7 +239,8 @@ class Evaluation:
         action: Any = np.zeros((lanes, self.task.spec.action_dim), np.float32)
         never: Any = np.zeros(lanes, bool)
         step = Step(obs, never.astype(np.float32), action, ~never, never)
-        memory = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*keys.shape, *leaf.shape)), self._empty())
+        empty = self.agent.reset(self.task.spec)
+        memory = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*keys.shape, *leaf.shape)), empty)
         record, total, length = _Record(lanes, episodes), np.zeros(lanes), np.zeros(lanes, int)
         explore, time = np.array([True, False]), 0
         while not record.full:
@@ -222,9 +260,6 @@ class Evaluation:
         """Close the environments, if there are any."""
         if self.environments is not None:
             self.environments.close()
-
-    def _empty(self) -> Any:
-        return self.agent.reset(self.task.spec)
 
 
 def _perceive(
