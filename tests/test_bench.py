@@ -37,6 +37,7 @@ def shapes(agent, spec):
     return jax.eval_shape(lambda key: agent.init(key, spec), jax.random.key(0))
 
 
+@pytest.mark.slow
 def test_bench_prints_one_object_of_positive_numbers(monkeypatch):
     monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")  # compiles sooner
     command = [sys.executable, "-m", "beliefrl.cli", "bench", "vrm", "--json", *SMALL.split()]

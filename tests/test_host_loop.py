@@ -164,6 +164,7 @@ def test_what_was_learned_before_a_fault_is_kept(tmp_path):
     assert np.all(np.abs(action) <= 1)
 
 
+@pytest.mark.slow
 def test_a_run_on_an_environment_is_evaluated_again(tmp_path):
     agent = agents.make("sac-mlp", **SHARED, **SMALL["sac-mlp"])
     run = train(agent, "gym:Pendulum-v1", tmp_path / "run", **few(steps=25, eval_every=25))

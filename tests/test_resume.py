@@ -233,6 +233,7 @@ main()
 """
 
 
+@pytest.mark.slow
 def test_a_disk_that_is_full_is_one_sentence(tmp_path):
     """No file may grow beyond 30 kB here, and a checkpoint is larger."""
     words = "train sac-mlp pendulum-v --steps 60 --step-start-rl 20 --pretrain-updates 5 --batch-size 8"
