@@ -1,7 +1,7 @@
 """Your own environment: anything with Gymnasium's interface, here a cart that must stop at a mark it drives towards.
 
     pip install beliefrl
-    python examples/01_your_own_environment.py                  # 6,000 steps: about four minutes
+    python examples/01_your_own_environment.py                  # 6,000 steps: about six minutes
     python examples/01_your_own_environment.py --steps 300      # to see it run
 
 An environment that is registered needs no Python at all; `my_robots` is the module that registers it:
