@@ -1,6 +1,7 @@
 """Training on the host's environments: equal to the compiled loop, in processes or not; and faults lose nothing."""
 
 import dataclasses
+import re
 
 import gymnasium
 import jax
@@ -120,8 +121,8 @@ def test_processes_of_their_own_change_nothing_and_end():
 @pytest.mark.parametrize(
     ("make", "phrase"),
     [
-        (Raising, "robot (seed 1, step 3): step raised ValueError: out of range."),
-        (Killed, "robot (step 3): the process of seed 0 (exit code -9)"),
+        (Raising, r"robot \(seed [01], step 3\): step raised ValueError: out of range\.$"),  # whichever is heard last
+        (Killed, r"robot \(step 3\): the process of seed [01] \(exit code -9\)"),
     ],
 )
 def test_a_fault_in_a_process_of_its_own_is_told_as_well(make, phrase):
@@ -131,7 +132,7 @@ def test_a_fault_in_a_process_of_its_own_is_told_as_well(make, phrase):
         for _ in range(5):
             lanes.step(np.zeros((2, 1), np.float32))
     lanes.close()
-    assert phrase in str(error.value)
+    assert re.match(phrase, str(error.value))
 
 
 class Late(Fine):
