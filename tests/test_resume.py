@@ -287,6 +287,9 @@ def test_a_second_signal_ends_the_program_at_once():
         ("resume {whole} --steps ten", "--steps cannot be 'ten'"),
         ("train sac-mlp pendulum-v --out {whole}", "exists already: choose another --out, or `beliefrl resume"),
         ("train sac-mlp pendulum-v --out {whole} --resume", "was trained with"),
+        ("train sac-mlp pendulum --out {whole} --resume", "was trained with task=pendulum-v, not pendulum"),
+        ("train sac-mlp pendulum --observe velocities --out {whole} --resume", "was trained with seeds=2, not 1"),
+        ("train sac-mlp pendulum-v --constants mass=3.5 --out {whole} --resume", "was trained with constants="),
         ("train vrm pendulum-v --out {whole} --resume", "was trained with agent=sac-mlp, not vrm"),
     ],
 )

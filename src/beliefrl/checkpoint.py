@@ -57,7 +57,6 @@ class Checkpoints:
     def __init__(self, folder: pathlib.Path, keep: int):
         """In `folder`/checkpoints; the last `keep` are kept."""
         self.folder, self.keep = folder / "checkpoints", keep
-        self.step: int | None = None  # of the last one
         self._segments: list[Segment] = []
         self._thread = ThreadPoolExecutor(1, "checkpoint")
         self._writing: Future[None] | None = None
@@ -76,7 +75,6 @@ class Checkpoints:
             UserError: the checkpoint before this one could not be written.
         """
         self.wait()
-        self.step = step
         state, new = arrays.copied(tree), self._new_moments(moments, added)
         self._writing = self._thread.submit(self._write, step, progress, state, new)
 

@@ -123,7 +123,7 @@ def train(argv: Sequence[str]) -> None:
     task = tasks.make(options.task, options.observe or None, **named_values(options.constants, "--constants"))
     console = Console()
     if options.resume and options.out is not None and listed(options.out):
-        _same_training(Run(options.out), name, options)
+        _same_training(Run(options.out), name, tasks.describe(task), options)
         _resume(options.out, options.training.steps)
         return
     with TrainingDisplay(console, options.training.steps) as display:
@@ -144,14 +144,12 @@ def _ended(run: Any) -> None:
     console.print(told, markup=False, highlight=False, soft_wrap=True)
 
 
-def _same_training(run: Any, agent: str, options: Any) -> None:
+def _same_training(run: Any, agent: str, task: dict[str, Any], options: Any) -> None:
     """Refuse to go on with a run that is of something else than the command line says."""
     from beliefrl.types import UserError
 
-    asked = {"agent": agent, "task": options.task, **dataclasses.asdict(options.training)}
-    asked |= dataclasses.asdict(options.agent)
-    there = {**run.config["options"], **run.config["hyperparameters"]}
-    there |= {"agent": run.config["agent"], "task": run.config["task"], "steps": options.training.steps}
+    asked = {"agent": agent, **task, **dataclasses.asdict(options.training), **dataclasses.asdict(options.agent)}
+    there = {**run.config, **run.config["options"], **run.config["hyperparameters"], "steps": options.training.steps}
     for name, value in asked.items():
         value = list(value) if isinstance(value, tuple) else value
         if there.get(name, value) != value:

@@ -70,7 +70,7 @@ class Run:
         Raises:
             UserError: a line is not what a training writes.
         """
-        path = self.folder / "metrics" / f"seed-{seed}.jsonl"
+        path = self._metrics(seed)
         if not path.exists():
             return
         with path.open(errors="replace") as lines:
@@ -79,6 +79,9 @@ class Run:
                     row = _parsed(line, f"Line {number} of {path}", ("step", "kind"))
                     if kind in (None, row["kind"]):
                         yield row
+
+    def _metrics(self, seed: int) -> pathlib.Path:
+        return self.folder / "metrics" / f"seed-{seed}.jsonl"
 
     def results(self) -> Row | None:
         """The summary of the last evaluation; None before there was one.
@@ -125,9 +128,6 @@ class Recorder(Run):
 
         self._lines = {seed: self._metrics(seed).open("a", buffering=1) for seed in self.seeds}
         self._events = {seed: SummaryWriter(str(self.folder / "tensorboard" / f"seed-{seed}")) for seed in self.seeds}
-
-    def _metrics(self, seed: int) -> pathlib.Path:
-        return self.folder / "metrics" / f"seed-{seed}.jsonl"
 
     def note_end(self) -> None:
         """Write down when this process has ended with the run."""
