@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 
 import jax.numpy as jnp
 import numpy as np
@@ -255,29 +254,6 @@ def test_a_folder_that_cannot_be_locked_is_one_sentence(whole, tmp_path):
     (tmp_path / "config.json").write_bytes((whole[0] / "config.json").read_bytes())
     with pytest.raises(UserError, match="cannot be written"):
         Recorder(tmp_path, None)
-
-
-SLEEPER = """
-import hashlib
-from beliefrl.stop import Requests
-with Requests():
-    print("ready", flush=True)
-    hashlib.pbkdf2_hmac('sha256', b'', b'', 10**9)  # one instruction of Python, as a compiled function is
-"""
-
-
-def test_a_second_signal_ends_the_program_at_once():
-    command = [sys.executable, "-c", "import signal; signal.signal(2, signal.default_int_handler)\n" + SLEEPER]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout.readline() == "ready\n"
-            process.send_signal(signal.SIGINT)
-            time.sleep(0.5)
-            assert process.poll() is None
-            process.send_signal(signal.SIGINT)
-            assert process.wait(timeout=20) == 130
-        finally:
-            process.kill()
 
 
 @pytest.mark.parametrize(

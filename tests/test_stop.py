@@ -1,0 +1,28 @@
+"""A second Ctrl-C is heard while a compiled function runs."""
+
+import signal
+import subprocess
+import sys
+import time
+
+SLEEPER = """
+import hashlib
+from beliefrl.stop import Requests
+with Requests():
+    print("ready", flush=True)
+    hashlib.pbkdf2_hmac('sha256', b'', b'', 10**9)  # one instruction of Python, as a compiled function is
+"""
+
+
+def test_a_second_signal_ends_the_program_at_once():
+    command = [sys.executable, "-c", "import signal; signal.signal(2, signal.default_int_handler)\n" + SLEEPER]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout.readline() == "ready\n"
+            process.send_signal(signal.SIGINT)
+            time.sleep(0.5)
+            assert process.poll() is None
+            process.send_signal(signal.SIGINT)
+            assert process.wait(timeout=20) == 130
+        finally:
+            process.kill()
