@@ -1,0 +1,48 @@
+"""`beliefrl bench`."""
+
+import json
+import time
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import tyro
+
+from beliefrl.arguments import agent_name, agent_options, parse
+
+STARTED = time.time()
+
+
+def bench(argv: Sequence[str]) -> None:
+    """`beliefrl bench AGENT ...`, `beliefrl bench all ...`."""
+    from beliefrl import agents
+
+    name, rest = agent_name(argv, "bench")
+
+    def option(kind: Any, default: Any, help: str) -> tuple[Any, Any]:
+        return Annotated[kind, tyro.conf.arg(help=help)], default
+
+    own = {
+        "obs": option(int, 6, "Numbers in an observation; the default is velocities-only Hopper's."),
+        "actions": option(int, 3, "Degrees of freedom; the default is Hopper's."),
+        "seeds": option(int, 1, "Seeds trained side by side in one program."),
+        "json": option(bool, False, "Print one JSON object."),
+    }
+    options = parse(agent_options(None if name == "all" else agents.find(name), own), rest, f"beliefrl bench {name}")
+    from beliefrl.bench import bench as run_bench
+
+    sizes = (options.obs, options.actions, options.seeds)
+    if name == "all":
+        results = {each: run_bench(agents.make(each), *sizes) for each in agents.names()}
+    else:
+        results = run_bench(options.agent, *sizes, STARTED)
+    if options.json:
+        print(json.dumps(results))
+    elif name == "all":
+        from rich.console import Console
+
+        from beliefrl.display import scalability_table
+
+        Console().print(scalability_table(results, options.obs, options.actions))
+    else:
+        for key, value in results.items():
+            print(f"{key:<28}{value:,.3f}" if isinstance(value, float) else f"{key:<28}{value}")

@@ -1,0 +1,88 @@
+"""What is asked of a run: `beliefrl show`, `evaluate` and `export`."""
+
+import dataclasses
+import json
+import pathlib
+from collections.abc import Sequence
+from typing import Annotated
+
+import tyro
+
+from beliefrl.arguments import parse
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluateOptions:
+    """Play new episodes with what a run has learned, with sampled actions and with mode actions."""
+
+    run: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="RUN")]
+    """The run's folder."""
+    episodes: int = 20
+    """Episodes for each seed of the run and each mode."""
+    seed: int = 0
+    """Of these episodes: the same seed gives the same numbers."""
+    json: bool = False
+    """Print one JSON object: per mode the mean, S.E.M., every seed's mean, and success."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportOptions:
+    """Write what a run has learned as one file that jax loads without this library (`beliefrl.Policy.export`)."""
+
+    run: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="RUN")]
+    """The run's folder."""
+    file: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="FILE")]
+    """The file to write; one that is there is replaced."""
+    seed: int | None = None
+    """Which of the run's seeds; None is its first."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ShowOptions:
+    """Show what a run was made with, how far it is, and what it is worth."""
+
+    run: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="RUN")]
+    """The run's folder."""
+
+
+def show(argv: Sequence[str]) -> None:
+    """`beliefrl show RUN`."""
+    options = parse(ShowOptions, argv, "beliefrl show")
+    from rich.console import Console
+
+    from beliefrl.display import results_table, run_table
+    from beliefrl.evaluation import agent_of
+    from beliefrl.runs import Run
+
+    run, console = Run(options.run), Console()
+    table, results = run_table(run, agent_of(run)), run.results()
+    console.print(table)
+    if results:
+        console.print(results_table(results, run.seeds, f"after {results['step']:,} steps"))
+
+
+def evaluate(argv: Sequence[str]) -> None:
+    """`beliefrl evaluate RUN ...`."""
+    options = parse(EvaluateOptions, argv, "beliefrl evaluate")
+    from rich.console import Console
+
+    from beliefrl.display import results_table
+    from beliefrl.evaluation import evaluate as play
+    from beliefrl.runs import Run
+
+    run = Run(options.run)
+    results = play(run, options.episodes, options.seed)
+    if options.json:
+        print(json.dumps(results))
+        return
+    title = f"{run.config['agent']} on {run.config['task']}, {options.episodes} episodes a seed"
+    Console().print(results_table(results, run.seeds, title))
+
+
+def export(argv: Sequence[str]) -> None:
+    """`beliefrl export RUN FILE ...`."""
+    options = parse(ExportOptions, argv, "beliefrl export")
+    from beliefrl.policy import load
+
+    load(options.run, options.seed).export(options.file)
+    print(f"written to {options.file}: jax.export.deserialize reads it")

@@ -1,0 +1,131 @@
+"""`beliefrl train` and `beliefrl resume`."""
+
+import dataclasses
+import pathlib
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import tyro
+
+from beliefrl.arguments import agent_name, agent_options, named_values, parse
+
+
+@dataclasses.dataclass(frozen=True)
+class ResumeOptions:
+    """Go on with a training from its last checkpoint, as if it had never stopped."""
+
+    run: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="RUN")]
+    """The run's folder."""
+    steps: int | None = None
+    """Train for so many environment steps in all; None: as many as before. They may only grow."""
+
+
+def train(argv: Sequence[str]) -> None:
+    """`beliefrl train AGENT TASK ...`."""
+    from rich.console import Console
+
+    from beliefrl import agents, tasks
+    from beliefrl.checkpoint import listed
+    from beliefrl.display import TrainingDisplay
+    from beliefrl.runs import Run
+    from beliefrl.schedule import Options
+    from beliefrl.train import train as run_training
+
+    name, rest = agent_name(argv, "train", "TASK")
+    options_type = agent_options(
+        agents.find(name),
+        {
+            "task": (
+                Annotated[
+                    tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK", help="`beliefrl tasks` lists them.")
+                ],
+                dataclasses.MISSING,
+            ),
+            "observe": (
+                Annotated[
+                    tuple[str, ...],
+                    tyro.conf.arg(
+                        metavar="ENTRIES",
+                        help="Entries of the observation that the agent sees: indices, or `velocities` or `positions` "
+                        "where the task says which they are. None given: all.",
+                    ),
+                ],
+                (),
+            ),
+            "constants": (
+                Annotated[
+                    tuple[str, ...],
+                    tyro.conf.arg(
+                        metavar="NAME=VALUE",
+                        help="Of a task's physics, or of a Gymnasium environment, such as max_episode_steps=500.",
+                    ),
+                ],
+                (),
+            ),
+            "training": (Annotated[Options, tyro.conf.arg(name="", help="How long, how often.")], Options()),
+            "out": (
+                Annotated[
+                    pathlib.Path | None,
+                    tyro.conf.arg(help="The run's folder, which must not exist. None: runs/AGENT-TASK-1, or the next."),
+                ],
+                None,
+            ),
+            "resume": (
+                Annotated[bool, tyro.conf.arg(help="Go on with the training in --out, if there is one already.")],
+                False,
+            ),
+        },
+    )
+    options = parse(options_type, rest, f"beliefrl train {name}")
+    task = tasks.make(options.task, options.observe or None, **named_values(options.constants, "--constants"))
+    console = Console()
+    if options.resume and options.out is not None and listed(options.out):
+        _same_training(Run(options.out), name, tasks.describe(task), options)
+        _resume(options.out, options.training.steps)
+        return
+    with TrainingDisplay(console, options.training.steps) as display:
+        run = run_training(options.agent, task, options.out, display, **dataclasses.asdict(options.training))
+    _ended(run)
+
+
+def _ended(run: Any) -> None:
+    """What a finished training is worth, and where it lies."""
+    from rich.console import Console
+
+    from beliefrl.display import results_table
+
+    console, results = Console(), run.results() or {}
+    title = f"{run.config['agent']} on {run.config['task']} after {results['step']:,} steps"
+    console.print(results_table(results, run.seeds, title))
+    told = f"saved in {run.folder}: see curve.png; `beliefrl evaluate {run.folder}` plays more episodes"
+    console.print(told, markup=False, highlight=False, soft_wrap=True)
+
+
+def _same_training(run: Any, agent: str, task: dict[str, Any], options: Any) -> None:
+    """Refuse to go on with a run that is of something else than the command line says."""
+    from beliefrl.types import UserError
+
+    asked = {"agent": agent, **task, **dataclasses.asdict(options.training), **dataclasses.asdict(options.agent)}
+    there = {**run.config, **run.config["options"], **run.config["hyperparameters"], "steps": options.training.steps}
+    for name, value in asked.items():
+        value = list(value) if isinstance(value, tuple) else value
+        if there.get(name, value) != value:
+            raise UserError(f"{run.folder} was trained with {name}={there[name]}, not {value}: choose another --out.")
+
+
+def resume(argv: Sequence[str]) -> None:
+    """`beliefrl resume RUN ...`."""
+    options = parse(ResumeOptions, argv, "beliefrl resume")
+    _resume(options.run, options.steps)
+
+
+def _resume(folder: pathlib.Path, steps: int | None) -> None:
+    from rich.console import Console
+
+    from beliefrl.display import TrainingDisplay
+    from beliefrl.runs import Run
+    from beliefrl.train import resume as go_on
+
+    run = Run(folder)
+    with TrainingDisplay(Console(), steps or run.config["options"]["steps"]) as display:
+        _ended(go_on(run, steps, report=display))
