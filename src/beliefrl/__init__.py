@@ -19,6 +19,8 @@ from beliefrl.policy import Policy, load
 from beliefrl.runs import Run
 from beliefrl.schedule import Event, Options
 from beliefrl.stop import Stopped
+from beliefrl.sweeps.plan import Experiment, grid
+from beliefrl.sweeps.run import sweep
 from beliefrl.tasks import Task, observe
 from beliefrl.tasks import make as make_task
 from beliefrl.tasks.gymnasium import GymnasiumTask
@@ -31,6 +33,7 @@ register()  # gymnasium.make("BeliefRL/PendulumV-v0")
 __all__ = [
     "Agent",
     "Event",
+    "Experiment",
     "GymnasiumTask",
     "Moment",
     "Options",
@@ -46,11 +49,13 @@ __all__ = [
     "WindowShape",
     "draw_curve",
     "evaluate",
+    "grid",
     "load",
     "make_agent",
     "make_task",
     "observe",
     "resume",
+    "sweep",
     "task_of",
     "train",
 ]

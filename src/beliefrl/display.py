@@ -1,17 +1,21 @@
 """What a training shows while it runs, and the tables at the end."""
 
 import dataclasses
+import pathlib
 import time
 from typing import Any
 
 import numpy as np
-from rich.console import Console
+from rich.console import Console, Group
+from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 from beliefrl.checkpoint import listed
 from beliefrl.runs import Run
 from beliefrl.schedule import Event
+from beliefrl.sweeps.progress import Forecast
+from beliefrl.sweeps.run import Status
 
 
 def duration(seconds: float) -> str:
@@ -99,6 +103,73 @@ class TrainingDisplay:
     def _line(self, now: float, line: str) -> None:
         """Print a line that stays, with the time since the start."""
         self.console.print(f"[{duration(now - self.began)}] {line}", markup=False, highlight=False, soft_wrap=True)
+
+
+class SweepDisplay:
+    """What runs, what is left and when it ends, live; a line for every training that begins or ends.
+
+    Where the output is not a terminal, only the lines.
+    """
+
+    def __init__(self, console: Console, folder: pathlib.Path):
+        """`folder` is the sweep's."""
+        self.console, self.folder = console, folder
+        self.forecast = Forecast(folder)
+        self.live = Live(console=console, transient=True, refresh_per_second=2, auto_refresh=False)
+        self.began = time.monotonic()
+        self.before: Status | None = None
+
+    def __enter__(self) -> "SweepDisplay":
+        if self.console.is_terminal:
+            self.live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.live.stop()
+        if self.before is not None:
+            done = f"{len(self.before.finished)} of {self.before.count} trainings finished in {self.folder}"
+            self._line(f"{done}; `beliefrl report {self.folder} -o report.html` shows them")
+
+    def __call__(self, status: Status) -> None:
+        """Show how far a sweep is."""
+        self.forecast.watch(status)
+        self._tell_changes(status)
+        if self.live.is_started:
+            self.live.update(self._table(status), refresh=True)
+
+    def _tell_changes(self, status: Status) -> None:
+        if self.before is None:
+            already = f", {len(status.finished)} of them finished already" if status.finished else ""
+            self._line(f"{status.count} trainings{already}, {len(status.running)} at a time")
+            self.before = Status([*status.finished], [])
+        for name in status.running:
+            if name not in self.before.running:
+                self._line(f"begins: {name}")
+        for training in status.finished[len(self.before.finished) :]:
+            self._line(f"finished: {training.name} ({self._summary(status)})")
+        for name, why in status.failed.items():
+            if name not in self.before.failed:
+                self._line(f"failed: {name}: {why}")
+        self.before = Status([*status.finished], [*status.waiting], dict(status.running), dict(status.failed))
+
+    def _summary(self, status: Status) -> str:
+        failed = f", {len(status.failed)} failed" if status.failed else ""
+        left = self.forecast.seconds_left(status)
+        ends = "" if left is None else f", about {duration(left)} left"
+        return f"{len(status.finished)} of {status.count} done{failed}, {len(status.waiting)} waiting{ends}"
+
+    def _table(self, status: Status) -> Group:
+        table = Table(box=None, pad_edge=False)
+        for heading in ("training", "step", "doing", "last return"):
+            table.add_column(heading, justify="right" if heading in ("step", "last return") else "left")
+        for name, progress in self.forecast.going.items():
+            last = "" if progress.last_return is None else f"{progress.last_return:.1f}"
+            table.add_row(name, f"{progress.step:,}/{progress.training.steps:,}", progress.doing, last)
+        return Group(table, f"[{duration(time.monotonic() - self.began)}] {self._summary(status)}".replace("[", "\\["))
+
+    def _line(self, line: str) -> None:
+        told = f"[{duration(time.monotonic() - self.began)}] {line}"
+        self.console.print(told, markup=False, highlight=False, soft_wrap=True)
 
 
 def results_table(results: dict[str, Any], seeds: list[int], title: str) -> Table:

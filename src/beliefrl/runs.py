@@ -13,25 +13,19 @@ Lines are written out one by one, so a killed training loses at most the line it
 import json
 import os
 import pathlib
-import platform
 import re
-import shutil
-import subprocess
-import sys
 from collections.abc import Collection, Iterator
-from datetime import UTC, datetime
-from importlib import metadata
 from typing import Any
 
-import jax
 import numpy as np
 
-from beliefrl import arrays
+from beliefrl import arrays, trackers
 from beliefrl.arrays import write_whole
+from beliefrl.provenance import now
+from beliefrl.trackers import Tracker
 from beliefrl.types import UserError
 
 Row = dict[str, Any]
-PACKAGES = ("beliefrl", "jax", "jaxlib", "equinox", "optax", "numpy")
 
 
 class Run:
@@ -80,6 +74,17 @@ class Run:
                     if kind in (None, row["kind"]):
                         yield row
 
+    def last_rows(self, seed: int, size: int = 32_768) -> list[Row]:
+        """The entries in the last `size` bytes of a seed's log, of a run that may be going on."""
+        path = self._metrics(seed)
+        if not path.exists():
+            return []
+        with path.open("rb") as file:
+            file.seek(max(0, path.stat().st_size - size))
+            lines = file.read().decode(errors="replace").split("\n")
+        whole = lines[:-1] if path.stat().st_size <= size else lines[1:-1]
+        return [_parsed(line, str(path), ("step", "kind")) for line in whole]
+
     def _metrics(self, seed: int) -> pathlib.Path:
         return self.folder / "metrics" / f"seed-{seed}.jsonl"
 
@@ -117,22 +122,21 @@ class Recorder(Run):
         if config is not None:
             _make(folder, config)
         super().__init__(folder)
-        self._lock = _locked(folder)
+        self._lock = locked(folder, "is being trained")
         self._lines: dict[int, Any] = {}
-        self._events: dict[int, Any] = {}
+        self._trackers: dict[int, list[Tracker]] = {}
         if config is not None:
             self._open()
 
     def _open(self) -> None:
-        from tensorboardX import SummaryWriter  # 0.5 s to import
-
         self._lines = {seed: self._metrics(seed).open("a", buffering=1) for seed in self.seeds}
-        self._events = {seed: SummaryWriter(str(self.folder / "tensorboard" / f"seed-{seed}")) for seed in self.seeds}
+        track = self.config["options"].get("track", ("tensorboard",))
+        self._trackers = {seed: trackers.open_all(track, self.folder, seed, self.config) for seed in self.seeds}
 
     def note_end(self) -> None:
         """Write down when this process has ended with the run."""
         session = self.config["resumed"][-1] if self.config.get("resumed") else self.config
-        session["ended"] = _now()
+        session["ended"] = now()
         _write_config(self.folder, self.config)
 
     def amend(self, changes: dict[str, Any], session: dict[str, Any]) -> None:
@@ -159,26 +163,22 @@ class Recorder(Run):
             if not path.exists() or path.stat().st_size < length:
                 raise UserError(f"{path} is shorter than when the checkpoint was written: restore it from a copy.")
             os.truncate(path, length)
-        shutil.rmtree(self.folder / "tensorboard", ignore_errors=True)
         self._open()
         for seed in self.seeds:
-            for row in self.rows(seed):
-                self._log_event(seed, row["kind"], row["step"], row)
+            whole = [tracker for tracker in self._trackers[seed] if tracker.is_whole]
+            for row in self.rows(seed) if whole else ():
+                _tell(whole, row["kind"], row["step"], row)
 
     def log(self, seed: int, kind: str, step: int, values: Row) -> None:
-        """Write one entry of a seed; numbers go to TensorBoard as well, of lists their mean."""
+        """Write one entry of a seed; numbers go to its trackers as well, of lists their mean."""
         self._lines[seed].write(json.dumps({"step": step, "kind": kind, **values}) + "\n")
-        self._log_event(seed, kind, step, values)
-
-    def _log_event(self, seed: int, kind: str, step: int, values: Row) -> None:
-        for name, value in values.items():
-            if name not in ("step", "kind") and isinstance(value, int | float | list):
-                self._events[seed].add_scalar(f"{kind}/{name}", float(np.mean(value)), step)
+        _tell(self._trackers[seed], kind, step, values)
 
     def flush(self) -> None:
         """Bring everything logged so far onto the disk."""
-        for writer in self._events.values():
-            writer.flush()
+        for of_seed in self._trackers.values():
+            for tracker in of_seed:
+                tracker.flush()
 
     def save(self, agents: Any, but: Collection[int] = ()) -> None:
         """Save the agents of all seeds but some, of which what was saved before stays; whole or not at all."""
@@ -194,9 +194,19 @@ class Recorder(Run):
 
     def close(self) -> None:
         """Close the logs, and let others write the folder."""
-        for writer in (*self._lines.values(), *self._events.values()):
+        for writer in (*self._lines.values(), *(each for of_seed in self._trackers.values() for each in of_seed)):
             writer.close()
         self._lock.close()
+
+
+def _tell(told: list[Tracker], kind: str, step: int, values: Row) -> None:
+    numbers = {
+        f"{kind}/{name}": float(np.mean(value))
+        for name, value in values.items()
+        if name not in ("step", "kind") and isinstance(value, int | float | list)
+    }
+    for tracker in told:
+        tracker.log(step, numbers)
 
 
 def _parsed(text: str, what: str, keys: tuple[str, ...]) -> Row:
@@ -225,8 +235,12 @@ def _write_config(folder: pathlib.Path, config: dict[str, Any]) -> None:
     write_whole(folder / "config.json", (json.dumps(config, indent=2, default=str) + "\n").encode())
 
 
-def _locked(folder: pathlib.Path) -> Any:
-    """An open file that no other process can lock; the system lets go of it when this one ends, however it ends."""
+def locked(folder: pathlib.Path, doing: str) -> Any:
+    """An open file that no other process can lock; the system lets go of it when this one ends, however it ends.
+
+    Raises:
+        UserError: the folder cannot be written, or another process is doing something with it.
+    """
     try:
         file = (folder / "lock").open("a+")
     except OSError as error:
@@ -241,7 +255,7 @@ def _locked(folder: pathlib.Path) -> Any:
         file.seek(0)
         who = file.read().strip() or "another"
         file.close()
-        raise UserError(f"{folder} is being trained by process {who}: stop it, or wait until it has ended.") from None
+        raise UserError(f"{folder} {doing} by process {who}: stop it, or wait until it has ended.") from None
     file.truncate(0)
     file.write(str(os.getpid()))
     file.flush()
@@ -262,33 +276,3 @@ def free_folder(name: str, parent: str = "runs") -> pathlib.Path:
     while (folder := pathlib.Path(parent) / f"{name}-{number}").exists():
         number += 1
     return folder
-
-
-def provenance() -> dict[str, Any]:
-    """What a run was made with: versions, machine, git commit, command line and time."""
-    return {
-        "versions": {"python": platform.python_version()} | {name: metadata.version(name) for name in PACKAGES},
-        "device": str(jax.devices()[0].device_kind),
-        "git_commit": _git_commit(),
-        "command": [os.path.basename(sys.argv[0]), *sys.argv[1:]],
-        "started": _now(),
-    }
-
-
-def _now() -> str:
-    return datetime.now(UTC).isoformat(timespec="seconds")
-
-
-def _git_commit() -> str | None:
-    """The commit of the source that is running, with a + where it was changed since; None outside a checkout."""
-    try:
-        found = subprocess.run(
-            ["git", "describe", "--always", "--abbrev=40", "--dirty=+", "--match="],
-            cwd=pathlib.Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            timeout=10,
-        )
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return found.stdout.strip() or None

@@ -6,12 +6,12 @@ yields what happens, `train` records it in a run's folder.
 
 import dataclasses
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
 
-from beliefrl import host_loop, phases
+from beliefrl import host_loop, phases, trackers
 from beliefrl.agents import Agent
 from beliefrl.evaluation import MOST_EPISODES
 from beliefrl.lockstep import PROCESSES
@@ -47,6 +47,9 @@ class Options:
     """Minutes between two checkpoints, if they pass sooner (0: none by time)."""
     keep_checkpoints: int = 2
     """How many of the last checkpoints are kept."""
+    track: tuple[Literal["tensorboard", "wandb"], ...] = ("tensorboard",)
+    """Where numbers go besides the run's own logs: tensorboard, wandb (extra `wandb`; offline unless WANDB_MODE says
+    otherwise), both, or nowhere."""
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
@@ -57,6 +60,9 @@ class Options:
         check_range(self, ("seeds",), 1, 10_000)
         check_range(self, ("seed",), 0, 2_000_000_000)
         check_choice(self, "processes", PROCESSES)
+        for name in self.track:
+            if name not in trackers.TRACKERS:
+                raise UserError(f"track={name} is impossible: it must be {' or '.join(trackers.TRACKERS)}.")
 
 
 class Progress(NamedTuple):

@@ -15,12 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from beliefrl import agents, runs, tasks
+from beliefrl import agents, runs, tasks, trackers
 from beliefrl.agents import Agent
 from beliefrl.analysis.curves import draw_curve
 from beliefrl.checkpoint import Checkpoints, listed
 from beliefrl.evaluation import MODES, agent_of, summary, task_of
 from beliefrl.phases import Seed
+from beliefrl.provenance import provenance
 from beliefrl.rollout import Episode
 from beliefrl.runs import Recorder, Run
 from beliefrl.schedule import Event, Options, Progress, Snapshot, capacity, stages
@@ -47,7 +48,7 @@ def train(
         out: the run's folder, which must not exist; None is runs/AGENT-TASK-1, or the next free number.
         report: called with every Event as it happens, for progress.
         options: the fields of `Options`: steps, seeds, seed, eval_every, eval_episodes, replay_capacity, processes,
-            checkpoint_steps, checkpoint_minutes, keep_checkpoints.
+            checkpoint_steps, checkpoint_minutes, keep_checkpoints, track.
 
     Returns:
         The finished run: its results, its log, its files (`runs`).
@@ -64,13 +65,13 @@ def train(
         if name not in known:
             raise UserError(f"Training has no option {name!r}: it has {', '.join(known)}.")
     chosen = Options(**options)
-    _ = capacity(agent, chosen), made.spec  # complain before there is a folder
+    _ = capacity(agent, chosen), made.spec, trackers.check(chosen.track)  # complain before there is a folder
     config = {
         "agent": agents.name_of(agent),
         "hyperparameters": dataclasses.asdict(agent),  # pyright: ignore[reportArgumentType]
         **tasks.describe(made),
         "options": dataclasses.asdict(chosen),
-        **runs.provenance(),
+        **provenance(),
     }
     recorder = Recorder(out or runs.free_folder(f"{config['agent']}-{config['task']}"), config)
     return _Training(recorder, agent, made, chosen, report).run()
@@ -107,7 +108,7 @@ def resume(
         if steps is not None and steps < before["steps"]:
             raise UserError(f"steps={steps} is impossible: {folder} trains for {before['steps']}, and may only grow.")
         options = dataclasses.replace(Options(**before), **({} if steps is None else {"steps": steps}))
-        recorder.amend({"options": dataclasses.asdict(options)}, runs.provenance())
+        recorder.amend({"options": dataclasses.asdict(options)}, provenance())
     except BaseException:
         recorder.close()
         raise
@@ -121,7 +122,10 @@ def _options(run: Run) -> dict[str, Any]:
     for name in run.config["options"]:
         if name not in known:
             raise UserError(f"{run.folder} was trained by another version: this one has no option {name!r}.")
-    return {"steps": Options.steps} | run.config["options"]
+    known_values = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in run.config["options"].items()
+    }
+    return {"steps": Options.steps} | known_values
 
 
 class _Training:

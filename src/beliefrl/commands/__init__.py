@@ -2,11 +2,12 @@
 
 from collections.abc import Callable, Sequence
 
-from beliefrl.commands import bench, lists, runs, training
+from beliefrl.commands import bench, lists, runs, sweep, training
 
 COMMANDS: dict[str, Callable[[Sequence[str]], None]] = {
     "train": training.train,
     "resume": training.resume,
+    "sweep": sweep.sweep,
     "show": runs.show,
     "evaluate": runs.evaluate,
     "export": runs.export,

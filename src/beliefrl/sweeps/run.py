@@ -1,0 +1,138 @@
+"""The loop of a sweep: start what is waiting where there is room, note what has ended, go on after a stop."""
+
+import dataclasses
+import os
+import pathlib
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+from beliefrl import runs
+from beliefrl.stop import Requests, Stopped
+from beliefrl.sweeps import cluster, local
+from beliefrl.sweeps import plan as plans
+from beliefrl.sweeps.plan import Experiment, Training
+from beliefrl.types import UserError
+
+LOOK_EVERY = 0.5  # seconds
+ALL = 10_000  # more seeds than an experiment has
+
+
+class Launcher(Protocol):
+    """Where trainings run: this machine (`local`) or a Ray cluster (`cluster`)."""
+
+    @property
+    def room(self) -> int: ...
+    def start(self, training: Training) -> None: ...
+    def ended(self) -> dict[str, int]: ...
+    def stop(self) -> None: ...
+
+
+@dataclasses.dataclass
+class Status:
+    """How far a sweep is."""
+
+    finished: list[Training]
+    waiting: list[Training]
+    running: dict[str, Training] = dataclasses.field(default_factory=dict)
+    failed: dict[str, str] = dataclasses.field(default_factory=dict)  # why, in its own words
+
+    @property
+    def count(self) -> int:
+        return len(self.finished) + len(self.waiting) + len(self.running) + len(self.failed)
+
+
+Report = Callable[[Status], None]
+
+
+def sweep(
+    experiments: Sequence[Experiment],
+    out: str | os.PathLike[str],
+    workers: int | None = None,
+    seeds_per_run: int | None = None,
+    ray: str | None = None,
+    report: Report | None = None,
+) -> Status:
+    """Train what experiments consist of, as many at a time as there is room for; those that fail are noted.
+
+    Args:
+        experiments: `beliefrl.grid(...)`, or a list of `beliefrl.Experiment`. None: what `out` has is gone on with.
+        out: the sweep's folder. What is finished in it is not done again, what was stopped goes on.
+        workers: most trainings at a time, on a core each; None: as many as there are cores, or GPUs. 0: one at a time,
+            with all the cores.
+        seeds_per_run: seeds side by side in one program; None: what pays, which is all on a GPU.
+        ray: where the head of a Ray cluster is (HOST:PORT, or auto), if it shall run there.
+        report: called twice a second with how far it is.
+
+    Raises:
+        UserError: a name, setting or value that is impossible, before anything begins; another process runs this sweep;
+            or a training has failed, when all the others have ended.
+        Stopped: Ctrl-C or SIGTERM, once every training has written a checkpoint. It is a KeyboardInterrupt.
+    """
+    folder = pathlib.Path(out)
+    plans.plan(experiments)  # complain before there is a folder
+    with _lock(folder):
+        slots = [] if ray else ["-"] if workers == 0 else local.slots(workers)
+        launcher = cluster.Cluster(folder, ray, workers) if ray else local.Local(folder, slots)
+        on_gpu = launcher.has_gpus if isinstance(launcher, cluster.Cluster) else slots[0].startswith("gpu")
+        together = seeds_per_run or (ALL if on_gpu else None)
+        status = _status(folder, plans.plan(experiments, together))
+        with Requests() as requests:
+            try:
+                _loop(folder, status, launcher, report or (lambda status: None), requests)
+            finally:
+                launcher.stop()
+    if status.failed:
+        name, why = next(iter(status.failed.items()))
+        raise UserError(
+            f"{len(status.failed)} of {status.count} trainings failed, such as {name} ({why.rstrip('.')}): mend that "
+            f"and give the command again; {folder}/logs has what each said."
+        )
+    return status
+
+
+def _status(folder: pathlib.Path, trainings: Sequence[Training]) -> Status:
+    """Where a sweep stands whose folder has these added to it."""
+    planned = {training.name: training for training in (*plans.read(folder), *trainings)}
+    plans.write(folder, list(planned.values()))
+    finished = [training for training in planned.values() if training.is_finished(folder)]
+    return Status(finished, [training for training in planned.values() if training not in finished])
+
+
+def _loop(folder: pathlib.Path, status: Status, launcher: Launcher, report: Report, requests: Requests) -> None:
+    while status.waiting or status.running:
+        while status.waiting and launcher.room:
+            training = status.waiting.pop(0)
+            launcher.start(training)
+            status.running[training.name] = training
+        for name, code in launcher.ended().items():
+            training = status.running.pop(name)
+            if code == 0:
+                status.finished.append(training)
+            else:
+                status.failed[name] = reason(folder / "logs" / f"{name}.log", code)
+        report(status)
+        if requests.number:
+            launcher.stop()
+            again = f"`beliefrl sweep --out {folder}` goes on from there."
+            raise Stopped(
+                f"stopped; {len(status.finished)} of {status.count} trainings are finished; {again}", requests.number
+            )
+        time.sleep(LOOK_EVERY)
+
+
+def reason(log: pathlib.Path, code: int) -> str:
+    """Why a training ended badly: the last thing it said."""
+    lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    said = [line.removeprefix("beliefrl: ") for line in lines if line.startswith("beliefrl: ")] or lines
+    return said[-1] if said else f"it ended with code {code} and said nothing"
+
+
+def _lock(folder: pathlib.Path) -> Any:
+    try:
+        (folder / "logs").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(
+            f"The sweep's folder {folder} cannot be made ({error.strerror}): choose another --out."
+        ) from None
+    return runs.locked(folder, "is being swept")

@@ -1,0 +1,99 @@
+"""Where a run's numbers go besides its own logs: TensorBoard, Weights & Biases. Chosen by `--track`.
+
+Nothing here goes over the network of its own accord: Weights & Biases is kept offline, in the run's folder, until the
+user says WANDB_MODE=online or sends it with `wandb sync`.
+"""
+
+import importlib.util
+import os
+import pathlib
+import shutil
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+from beliefrl.types import UserError
+
+
+class Tracker(Protocol):
+    """Is told the numbers of one seed."""
+
+    is_whole: bool  # told everything again when a training goes on; else only what is new
+
+    def log(self, step: int, values: dict[str, float]) -> None: ...
+    def flush(self) -> None: ...
+    def close(self) -> None: ...
+
+
+class TensorBoard:
+    """Event files in tensorboard/seed-N."""
+
+    is_whole = True
+
+    def __init__(self, folder: pathlib.Path, seed: int, config: dict[str, Any]):
+        from tensorboardX import SummaryWriter  # 0.5 s to import
+
+        path = folder / "tensorboard" / f"seed-{seed}"
+        shutil.rmtree(path, ignore_errors=True)
+        self._writer = SummaryWriter(str(path))
+
+    def log(self, step: int, values: dict[str, float]) -> None:
+        for name, value in values.items():
+            self._writer.add_scalar(name, value, step)
+
+    def flush(self) -> None:
+        self._writer.flush()
+
+    def close(self) -> None:
+        self._writer.close()
+
+
+class WandB:
+    """A run of Weights & Biases a seed, all of one group, in wandb/."""
+
+    is_whole = False
+
+    def __init__(self, folder: pathlib.Path, seed: int, config: dict[str, Any]):
+        import wandb
+
+        name = f"{folder.name}-seed-{seed}"
+        self._run = wandb.init(
+            project=os.environ.get("WANDB_PROJECT", "beliefrl"),
+            group=folder.name,
+            name=name,
+            id=f"{config.get('started', '')}-{name}".replace(":", "-").replace("+", "-"),
+            dir=str(folder),
+            config={**config, "seed": seed},
+            mode=_mode(),
+            resume="allow",
+            reinit="create_new",
+            settings=wandb.Settings(console="off", silent=True),
+        )
+        self._run.define_metric("step")
+        self._run.define_metric("*", step_metric="step")
+
+    def log(self, step: int, values: dict[str, float]) -> None:
+        self._run.log({"step": step, **values})
+
+    def flush(self) -> None:
+        """It writes by itself."""
+
+    def close(self) -> None:
+        self._run.finish()
+
+
+def _mode() -> Any:
+    return os.environ.get("WANDB_MODE", "offline")
+
+
+TRACKERS: dict[str, type[TensorBoard] | type[WandB]] = {"tensorboard": TensorBoard, "wandb": WandB}
+
+
+def check(names: Sequence[str]) -> None:
+    """Raise a UserError where a tracker's package is not installed."""
+    if "wandb" in names and importlib.util.find_spec("wandb") is None:
+        raise UserError("track=wandb needs Weights & Biases: pip install 'beliefrl[wandb]'.")
+
+
+def open_all(names: Sequence[str], folder: pathlib.Path, seed: int, config: dict[str, Any]) -> list[Tracker]:
+    """The trackers of a seed."""
+    return [TRACKERS[name](folder, seed, config) for name in names]

@@ -1,0 +1,31 @@
+"""One training of a sweep in a process of its own: `python -m beliefrl.worker [CORE] train ...`.
+
+It is the command line's `train`, on one core, and stops (with a checkpoint) if whoever started it has died.
+"""
+
+import ctypes
+import os
+import signal
+import sys
+
+STOP_WITH_PARENT = 1  # prctl's PR_SET_PDEATHSIG
+
+
+def main(argv: list[str]) -> None:
+    """Train on the core that is named first, or wherever the system likes where that is `-`."""
+    parent = os.getppid()
+    core, *command = argv
+    if core != "-":
+        os.sched_setaffinity(0, {int(core)})  # before XLA counts the cores
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(STOP_WITH_PARENT, signal.SIGTERM)
+        if os.getppid() != parent:
+            raise SystemExit(128 + signal.SIGTERM)
+    sys.argv = ["beliefrl", *command]  # what the run's config will say
+    from beliefrl import cli
+
+    cli.main(command)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
