@@ -101,7 +101,8 @@ def _experiments(options: SweepOptions) -> list:
         raise UsageError(
             "Nothing is named to run: give --preset, or --agents and --tasks, or a FILE, or an --out to go on."
         )
-    return [plan.shrunk(each, options.scale) for each in _with_settings(chosen, options)]
+    chosen = _with_settings(chosen, options)
+    return chosen if options.scale == 1 else [plan.shrunk(each, options.scale) for each in chosen]
 
 
 def _with_settings(experiments: list, options: SweepOptions) -> list:
