@@ -20,6 +20,10 @@ class Curve(NamedTuple):
     steps: np.ndarray  # (evaluation,)
     seeds: np.ndarray  # (seed, evaluation)
 
+    def since(self, chosen: np.ndarray) -> "Curve":
+        """Only the evaluations where `chosen` (evaluation,)."""
+        return Curve(self.steps[chosen], self.seeds[:, chosen])
+
 
 class Group:
     """All seeds of one agent with one set of settings on one task, out of any number of runs."""

@@ -2,12 +2,13 @@
 
 from collections.abc import Callable, Sequence
 
-from beliefrl.commands import bench, lists, runs, sweep, training
+from beliefrl.commands import bench, figure, lists, runs, sweep, training
 
 COMMANDS: dict[str, Callable[[Sequence[str]], None]] = {
     "train": training.train,
     "resume": training.resume,
     "sweep": sweep.sweep,
+    "figure": figure.figure,
     "show": runs.show,
     "evaluate": runs.evaluate,
     "export": runs.export,

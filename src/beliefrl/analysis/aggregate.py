@@ -1,0 +1,112 @@
+"""Agents over many tasks in one number and one picture, with intervals (Agarwal et al. 2021, Sections 4.1 to 4.3).
+
+A score is the return at the end of training put on a scale on which 0 is what a random policy gets and 1 is what there
+is to get (`BOUNDS`). The interquartile mean is the mean of the middle half of all seeds' scores on all tasks; the
+performance profile is the fraction of them over τ, for every τ. Intervals are of 95 %, by a bootstrap that draws seeds
+anew within each task (stratified).
+"""
+
+import pathlib
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from beliefrl.analysis.groups import Group
+from beliefrl.analysis.palette import colours
+from beliefrl.analysis.panels import add_legend, counts, tasks_of, with_curve
+from beliefrl.figures import figure, save
+from beliefrl.types import UserError
+
+Scores = Sequence[Float[np.ndarray, " seed"]]  # for each task
+
+BOUNDS = {  # returns of a random policy (uniform actions, 1,000 episodes, measured) and of a good one
+    "pendulum": (-1_214.4, -150.0),
+    "cartpole": (17.4, 1_000.0),
+    "target-reaching": (0.7, 140.0),
+}
+RESAMPLES = 2_000
+LEVEL = 0.95
+
+
+def interquartile_mean(scores: Scores) -> float:
+    """The mean of the middle half of all scores."""
+    from scipy.stats import trim_mean
+
+    return float(trim_mean(np.concatenate(scores), 0.25))
+
+
+def profile(scores: Scores, thresholds: Float[np.ndarray, " threshold"]) -> Float[np.ndarray, " threshold"]:
+    """The fraction of all scores that is greater than each threshold."""
+    return np.mean(np.concatenate(scores)[:, None] > thresholds, axis=0)
+
+
+def interval(
+    statistic: Callable[[Scores], Any], scores: Scores, resamples: int = RESAMPLES, seed: int = 0
+) -> tuple[Any, Any]:
+    """The ends of the statistic's 95 % interval: percentiles over sets of seeds drawn anew within each task."""
+    random = np.random.default_rng(seed)
+    drawn = [statistic([random.choice(task, task.size) for task in scores]) for _ in range(resamples)]
+    low, high = np.quantile(drawn, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0)
+    return low, high
+
+
+def scores(groups: Sequence[Group], mode: str = "sampled") -> dict[str, Scores]:
+    """The normalised final returns of each label on the tasks that all labels have; a seed that diverged has score 0.
+
+    Tasks without an entry in BOUNDS go from 0 to the best mean return of these groups.
+    """
+    groups = with_curve(groups, mode)
+    labels = list(dict.fromkeys(group.label for group in groups))
+    tasks = [task for task in tasks_of(groups) if {g.label for g in groups if g.task == task} == set(labels)]
+    if not tasks:
+        raise UserError("There is no task that all of these agents have: name runs of the same tasks.")
+    final = {(group.task, group.label): group.curve(mode).seeds[:, -1] for group in groups}
+    table: dict[str, Scores] = {}
+    for label in labels:
+        table[label] = [_normalised(final[task, label], bounds(task, final)) for task in tasks]
+    return table
+
+
+def bounds(task: str, final: dict[tuple[str, str], np.ndarray]) -> tuple[float, float]:
+    """The returns that score 0 and 1."""
+    known = next((both for name, both in BOUNDS.items() if task.startswith(name)), None)
+    best = max((float(np.nanmean(values)) for (of, _), values in final.items() if of == task), default=1.0)
+    return known or (0.0, best if best > 0 else 1.0)
+
+
+def _normalised(returns: np.ndarray, ends: tuple[float, float]) -> np.ndarray:
+    low, high = ends
+    return np.nan_to_num((returns - low) / (high - low), nan=0.0)
+
+
+def draw_aggregate(groups: Sequence[Group], out: pathlib.Path, mode: str = "sampled") -> pathlib.Path:
+    """Interquartile means with intervals, and performance profiles; returns the path of the PNG.
+
+    Raises:
+        UserError: there is no task that all agents have, or the files cannot be written.
+    """
+    table = scores(groups, mode)
+    colour = colours(list(table))
+    made = figure(8.0, 3.2)
+    left, right = made.subplots(1, 2, width_ratios=(1, 1.3))
+    thresholds = np.linspace(0.0, 1.0, 101)
+    for row, (label, values) in enumerate(reversed(table.items())):
+        low, high = interval(interquartile_mean, values)
+        left.barh(row, high - low, left=low, height=0.5, color=colour[label], alpha=0.35)
+        left.plot([interquartile_mean(values)] * 2, [row - 0.25, row + 0.25], color=colour[label], linewidth=2)
+        low, high = interval(lambda drawn: profile(drawn, thresholds), values)
+        right.plot(thresholds, profile(values, thresholds), color=colour[label], linewidth=1.6)
+        right.fill_between(thresholds, low, high, color=colour[label], alpha=0.15, linewidth=0)
+    left.set_yticks(range(len(table)), list(reversed(table)))
+    left.set_xlabel("interquartile mean of scores")
+    right.set_xlabel("score τ")
+    right.set_ylabel("fraction of runs with score > τ")
+    for axis in (left, right):
+        axis.grid(alpha=0.25)
+        axis.spines[["top", "right"]].set_visible(False)
+    tasks, seeds = len(next(iter(table.values()))), sorted({len(task) for of in table.values() for task in of})
+    counted = f"{tasks} {'task' if tasks == 1 else 'tasks'}, {counts(seeds)} seeds of each"
+    add_legend(made, colour, f"{counted}; 95 % stratified bootstrap intervals")
+    return save(made, out)

@@ -1,0 +1,55 @@
+"""Return beside the negative ELBO of the keep-learning model, on two axes (Section 5.4)."""
+
+import pathlib
+from collections.abc import Sequence
+
+import numpy as np
+
+from beliefrl.analysis.groups import Curve, Group
+from beliefrl.analysis.palette import colours
+from beliefrl.analysis.panels import add_legend, draw_line, finish, panels, spread, with_curve
+from beliefrl.figures import save
+from beliefrl.types import UserError
+
+NAMES = ("negative_elbo", "prediction_error")  # what an agent's model learns to make small, as its log calls it
+GREY = "#444444"
+
+
+def model_loss(group: Group) -> Curve | None:
+    """The model's loss, a mean over the updates since the evaluation before; None if there is no model that learns."""
+    steps = group.curve().steps
+    table = []
+    for run, seed in group.seeds:
+        rows = list(run.rows(seed, "update"))
+        found = [name for name in NAMES if rows and name in rows[-1]]
+        if not found:
+            return None
+        at = np.array([row["step"] for row in rows])
+        losses = np.array([row[found[0]] for row in rows])
+        within = [losses[(at > low) & (at <= high)] for low, high in zip([0, *steps[:-1]], steps, strict=True)]
+        table.append([part.mean() if part.size else np.nan for part in within])
+    return Curve(steps, np.array(table)).since(~np.all(np.isnan(table), axis=0))
+
+
+def draw_elbo(groups: Sequence[Group], out: pathlib.Path, mode: str = "sampled") -> pathlib.Path:
+    """Draw both, mean and S.E.M. over seeds, a panel an agent and task; returns the path of the PNG.
+
+    Raises:
+        UserError: no run has a model that keeps learning, or the files cannot be written.
+    """
+    shown = [(group, loss) for group in with_curve(groups, mode) if (loss := model_loss(group)) is not None]
+    if not shown:
+        raise UserError("None of these runs has a model that keeps learning: give runs of vrm.")
+    colour = colours([group.label for group, _ in shown])
+    made, axes = panels(len(shown), 2)
+    for axis, (group, loss) in zip(axes, shown, strict=True):
+        draw_line(axis, group.curve(mode), colour[group.label], "return")
+        finish(axis, f"{group.label} on {group.task}", "return")
+        right = axis.twinx()
+        draw_line(right, loss, GREY, "negative ELBO", linestyle="--")
+        right.set_ylabel("loss of the model (dashed)", fontsize=9)
+        right.tick_params(labelsize=8)
+        right.spines["top"].set_visible(False)
+    lines = {group.label: colour[group.label] for group, _ in shown} | {"loss of the model (dashed)": GREY}
+    add_legend(made, lines, spread([group for group, _ in shown]))
+    return save(made, out)

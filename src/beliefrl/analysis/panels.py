@@ -1,0 +1,163 @@
+"""Learning curves of many agents on many tasks: a panel a task, a line an agent (Section 5, Appendices C, F)."""
+
+import pathlib
+from collections.abc import Callable, Collection, Sequence
+from typing import Any
+
+import numpy as np
+
+from beliefrl.analysis.curves import standard_error
+from beliefrl.analysis.groups import Curve, Group
+from beliefrl.analysis.palette import colours
+from beliefrl.figures import figure, save
+from beliefrl.types import UserError
+
+COLUMNS = 3
+PANEL = (3.5, 2.7)  # inches
+
+
+def draw_curves(groups: Sequence[Group], out: pathlib.Path, mode: str = "sampled") -> pathlib.Path:
+    """Return over environment steps, mean and S.E.M. over seeds; a second panel for success where a task has it.
+
+    Args:
+        groups: lines, of which those of one task share a panel.
+        out: the picture is written as .png and .pdf.
+        mode: of the actions, sampled (as in the paper) or mode.
+
+    Returns:
+        The path of the PNG.
+
+    Raises:
+        UserError: no group has an evaluation of all its seeds, or the files cannot be written.
+    """
+    groups = with_curve(groups, mode)
+    entries = [(task, "") for task in tasks_of(groups)]
+    entries += [(task, "_success") for task in tasks_of([group for group in groups if group.has_success])]
+    labels = list(dict.fromkeys(group.label for group in groups))
+    colour = colours(labels)
+    made, axes = panels(len(entries), len(labels))
+    for axis, (task, suffix) in zip(axes, entries, strict=True):
+        for group in groups:
+            if group.task == task and (not suffix or group.has_success):
+                draw_line(axis, group.curve(mode + suffix), colour[group.label], group.label)
+        finish(axis, task, "success rate" if suffix else "return")
+    add_legend(made, {label: colour[label] for label in labels}, spread(groups))
+    return save(made, out)
+
+
+def with_curve(groups: Sequence[Group], mode: str) -> list[Group]:
+    """Those that have something to draw.
+
+    Raises:
+        UserError: there is none.
+    """
+    chosen = [group for group in groups if group.curve(mode).steps.size]
+    if not chosen:
+        raise UserError("No run has an evaluation of all its seeds yet: there is no curve to draw.")
+    return chosen
+
+
+def tasks_of(groups: Sequence[Group]) -> list[str]:
+    return list(dict.fromkeys(group.task for group in groups))
+
+
+def panels(count: int, lines: int) -> tuple[Any, list[Any]]:
+    """A figure with so many panels, and with room for a legend below them."""
+    columns = min(COLUMNS, count)
+    rows = -(-count // columns)
+    width = max(columns * PANEL[0], 4.5)
+    made = figure(width, rows * PANEL[1] + 0.25 * -(-lines // legend_columns(width)) + 0.2)
+    axes = list(made.subplots(rows, columns, squeeze=False).flat)
+    for unused in axes[count:]:
+        unused.remove()
+    return made, axes[:count]
+
+
+def draw_line(axis: Any, curve: Curve, colour: str, label: str, **style: Any) -> None:
+    """Mean and S.E.M. over seeds."""
+    mean, error = np.nanmean(curve.seeds, axis=0), standard_error(curve.seeds)
+    axis.plot(curve.steps, mean, color=colour, linewidth=1.6, label=label, **style)
+    axis.fill_between(curve.steps, mean - error, mean + error, color=colour, alpha=0.2, linewidth=0)
+
+
+def finish(axis: Any, title: str, ordinate: str) -> None:
+    """Title, labels, grid."""
+    axis.set_title(title, fontsize=10)
+    axis.set_xlabel("environment steps", fontsize=9)
+    axis.set_ylabel(ordinate, fontsize=9)
+    axis.tick_params(labelsize=8)
+    axis.xaxis.set_major_formatter(thousands)
+    axis.xaxis.set_major_locator(_locator())
+    axis.grid(alpha=0.25)
+    axis.spines[["top", "right"]].set_visible(False)
+
+
+def thousands(value: float, _: Any = None) -> str:
+    """20000 as 20k."""
+    return f"{value / 1000:g}k" if value else "0"
+
+
+def _locator() -> Any:
+    from matplotlib.ticker import MaxNLocator
+
+    return MaxNLocator(5)
+
+
+def legend_columns(width: float) -> int:
+    return max(1, int(width / 2.1))
+
+
+def add_legend(made: Any, colour: dict[str, str], title: str) -> None:
+    """One legend below all panels."""
+    from matplotlib.lines import Line2D
+
+    lines = [Line2D([], [], color=each, linewidth=2, label=label) for label, each in colour.items()]
+    columns = legend_columns(made.get_figwidth())
+    made.legend(
+        handles=lines,
+        loc="outside lower center",
+        ncols=min(columns, len(lines)),
+        frameon=False,
+        fontsize=9,
+        title=title,
+        title_fontsize=8,
+    )
+
+
+def spread(groups: Sequence[Group]) -> str:
+    """What lines are the mean of."""
+    seeds = {len(group.seeds) for group in groups}
+    return "1 seed each" if seeds == {1} else f"mean and S.E.M. of {counts(seeds)} seeds"
+
+
+def counts(numbers: Collection[int]) -> str:
+    """3, or 2 to 5."""
+    low, high = min(numbers), max(numbers)
+    return str(low) if low == high else f"{low} to {high}"
+
+
+def pooled(groups: Sequence[Group], drawn: Callable[[int], dict[str, Any]], papers: dict[str, Any]) -> list[Group]:
+    """VRM with the paper's settings, and with settings drawn anew for every seed: two groups a task (Appendix F).
+
+    Args:
+        groups: runs of VRM.
+        drawn: the settings of a seed.
+        papers: the paper's settings.
+
+    Raises:
+        UserError: a task has no run with the paper's settings, or none with those of its seed.
+    """
+
+    def has(run: Any, settings: dict[str, Any]) -> bool:
+        return all(run.config["hyperparameters"].get(name) == value for name, value in settings.items())
+
+    made = []
+    for task in tasks_of(groups):
+        seeds = [seed for group in groups if group.task == task and group.agent == "vrm" for seed in group.seeds]
+        usual = [(run, seed) for run, seed in seeds if has(run, papers)]
+        other = [(run, seed) for run, seed in seeds if has(run, drawn(seed))]
+        if usual and other:
+            made += [Group(task, "vrm, the paper's settings", usual), Group(task, "vrm, drawn settings", other)]
+    if not made:
+        raise UserError("These runs are no sensitivity study: `beliefrl sweep --preset sensitivity` makes one.")
+    return made

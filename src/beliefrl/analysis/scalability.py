@@ -1,0 +1,100 @@
+"""What trainings cost: wall-clock time and parameters of each agent, as Markdown and as LaTeX (Appendix G)."""
+
+import math
+import pathlib
+from collections.abc import Sequence
+from datetime import datetime
+from typing import NamedTuple
+
+import numpy as np
+
+from beliefrl import arrays
+from beliefrl.analysis.groups import Group, last_step
+from beliefrl.arrays import write_whole
+from beliefrl.runs import Run
+from beliefrl.types import UserError
+
+STEPS = 100_000  # of the paper's table
+
+
+class Cost(NamedTuple):
+    label: str
+    task: str
+    seconds: float | None  # for STEPS environment steps of one seed, pre-training and compilation in it; None: unknown
+    parameters: int | None  # numbers in the networks of one seed; None: no agent was saved
+    steps: int  # that were timed
+
+
+def wall_clock(run: Run) -> float | None:
+    """Seconds that a run's sessions took together; None where one was killed, so that nobody knows its end."""
+    sessions = [run.config, *run.config.get("resumed", ())]
+    if not all("started" in session and "ended" in session for session in sessions):
+        return None
+    spans = [datetime.fromisoformat(each["ended"]) - datetime.fromisoformat(each["started"]) for each in sessions]
+    return sum(span.total_seconds() for span in spans)
+
+
+def parameters(run: Run) -> int | None:
+    """How many numbers the networks of one seed hold, optimisers apart."""
+    path = run.folder / "agent.safetensors"
+    if not path.exists():
+        return None
+    saved = arrays.load(path)
+    return sum(values.size for name, values in saved.items() if "optimiser" not in name) // len(run.seeds)
+
+
+def costs(groups: Sequence[Group]) -> list[Cost]:
+    """What each agent cost, the median over its runs."""
+    made = []
+    for group in groups:
+        spans = [(wall_clock(run), max(last_step(run, seed) for seed in run.seeds), run) for run in group.runs]
+        timed = [span / steps / len(run.seeds) for span, steps, run in spans if span is not None and steps]
+        sizes = [size for run in group.runs if (size := parameters(run)) is not None]
+        seconds = float(np.median(timed)) * STEPS if timed else None
+        steps = max((steps for _, steps, _ in spans), default=0)
+        made.append(Cost(group.label, group.task, seconds, sizes[0] if sizes else None, steps))
+    return made
+
+
+HEADINGS = ("agent", "task", f"wall-clock time ({STEPS:,} steps)", "parameters", "steps timed")
+
+
+def _cells(cost: Cost) -> tuple[str, ...]:
+    hours = "unknown" if cost.seconds is None else _hours(cost.seconds)
+    size = "unknown" if cost.parameters is None else f"{cost.parameters / 1e6:.2f} M"
+    return (cost.label, cost.task, hours, size, f"{cost.steps:,}")
+
+
+def _hours(seconds: float) -> str:
+    return f"{seconds / 3600:.2f} h" if seconds >= 600 else f"{math.ceil(seconds / 6) / 10:.1f} min"
+
+
+def markdown(table: Sequence[Cost]) -> str:
+    """The table in Markdown."""
+    lines = [HEADINGS, ("---", "---", "---:", "---:", "---:"), *map(_cells, table)]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def latex(table: Sequence[Cost]) -> str:
+    """The table in LaTeX, for the package booktabs."""
+
+    def row(cells: Sequence[str]) -> str:
+        return "    " + " & ".join(cell.replace("_", r"\_").replace("%", r"\%") for cell in cells) + r" \\"
+
+    head = [r"\begin{tabular}{llrrr}", r"    \toprule", row(HEADINGS), r"    \midrule"]
+    return "\n".join([*head, *(row(_cells(cost)) for cost in table), r"    \bottomrule", r"\end{tabular}"]) + "\n"
+
+
+def write_table(groups: Sequence[Group], out: pathlib.Path) -> pathlib.Path:
+    """Write the table as .md and .tex; returns the path of the first.
+
+    Raises:
+        UserError: the files cannot be written.
+    """
+    table = costs(groups)
+    try:
+        write_whole(out.with_suffix(".tex"), latex(table).encode())
+        write_whole(out.with_suffix(".md"), markdown(table).encode())
+    except OSError as error:
+        raise UserError(f"{out} cannot be written ({error.strerror}): choose another --out.") from None
+    return out.with_suffix(".md")
