@@ -9,11 +9,12 @@ import os
 import pathlib
 import shutil
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from beliefrl.types import UserError
 
 
+@runtime_checkable
 class Tracker(Protocol):
     """Is told the numbers of one seed."""
 

@@ -5,7 +5,7 @@ import os
 import pathlib
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from beliefrl import runs
 from beliefrl.stop import Requests, Stopped
@@ -18,6 +18,7 @@ LOOK_EVERY = 0.5  # seconds
 ALL = 10_000  # more seeds than an experiment has
 
 
+@runtime_checkable
 class Launcher(Protocol):
     """Where trainings run: this machine (`local`) or a Ray cluster (`cluster`)."""
 
