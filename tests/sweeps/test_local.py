@@ -1,0 +1,150 @@
+"""Trainings in processes of their own on this machine; whole sweeps in the slow tests."""
+
+import contextlib
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from beliefrl import cli, sweep
+from beliefrl.runs import Run
+from beliefrl.stop import Stopped
+from beliefrl.sweeps import local
+from beliefrl.sweeps.plan import Experiment, Training, grid
+from beliefrl.sweeps.run import reason
+from beliefrl.types import UserError
+
+QUICK = {"steps": 300, "eval_every": 100, "eval_episodes": 1, "step_start_rl": 100, "pretrain_updates": 5}
+
+
+def rows(folder):
+    return (folder / "metrics" / "seed-0.jsonl").read_text()
+
+
+def test_a_training_that_fails_frees_its_core_and_says_why(tmp_path):
+    (tmp_path / "logs").mkdir()
+    launcher = local.Local(tmp_path, ["0"])
+    launcher.start(Training("wrong", "vmr", "pendulum", {}, {"steps": 1, "seed": 0, "seeds": 1}))
+    assert launcher.room == 0
+    while not (codes := launcher.ended()):
+        time.sleep(0.05)
+    assert codes == {"wrong": 2}
+    assert launcher.room == 1
+    assert "no agent 'vmr'" in reason(tmp_path / "logs" / "wrong.log", 2)
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="This system cannot choose cores.")
+def test_a_worker_runs_on_its_core():
+    core = max(os.sched_getaffinity(0))
+    code = (
+        f"import os; from beliefrl import worker; worker.main(['{core}', '--version']); print(os.sched_getaffinity(0))"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert out.splitlines()[-1] == f"{{{core}}}"
+
+
+def test_there_is_a_slot_for_each_core_and_no_more_than_asked_for(monkeypatch):
+    monkeypatch.setattr(local, "_gpus", lambda: 0)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3, 1, 2}, raising=False)
+    assert local.slots() == ["1", "2", "3"]
+    assert local.slots(2) == ["1", "2"]
+    assert local.slots(4) == ["1", "2", "3", "any"]
+    monkeypatch.setattr(local, "_gpus", lambda: 2)
+    assert local.slots() == ["gpu0", "gpu1"]
+    assert local.slots(1) == ["gpu0"]
+
+
+def test_a_training_has_one_thread_on_a_core_and_one_gpu_on_a_gpu(tmp_path, monkeypatch):
+    monkeypatch.delenv("NPROC", raising=False)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5")
+    assert local.environment(tmp_path, "0")["NPROC"] == "1"
+    assert "NPROC" not in local.environment(tmp_path, "-")
+    on_gpu = local.environment(tmp_path, "gpu3")
+    assert on_gpu["CUDA_VISIBLE_DEVICES"] == "3"
+    assert pathlib.Path(on_gpu["JAX_COMPILATION_CACHE_DIR"]).is_relative_to(tmp_path)
+
+
+@pytest.mark.slow
+def test_a_sweep_is_its_trainings_and_a_failure_harms_no_other(tmp_path):
+    """The log of a seed is that of the same training alone; an environment that breaks is told at the end."""
+    experiments = [
+        *grid(["sac-mlp"], ["pendulum-v"], seeds=2, **QUICK),
+        Experiment("sac-mlp", "gym:wrong:Raises-v0", QUICK, seeds=(0,)),
+    ]
+    wrong = tmp_path / "wrong.py"
+    wrong.write_text(
+        "import gymnasium\n"
+        "class Raises(gymnasium.Env):\n"
+        "    observation_space = gymnasium.spaces.Box(-1, 1, (1,))\n"
+        "    action_space = gymnasium.spaces.Box(-1, 1, (1,))\n"
+        "    def reset(self, *, seed=None, options=None):\n"
+        "        self.steps = 0\n"
+        "        return self.observation_space.sample(), {}\n"
+        "    def step(self, action):\n"
+        "        self.steps += 1\n"
+        "        if self.steps > 150: raise RuntimeError('the wheel came off')\n"
+        "        return self.observation_space.sample(), 0.0, False, False, {}\n"
+        "gymnasium.register('Raises-v0', 'wrong:Raises', max_episode_steps=200)\n"
+    )
+    with contextlib.chdir(tmp_path):
+        sys.path.insert(0, "")
+        with pytest.raises(UserError, match=r"1 of 3 trainings failed.*the wheel came off"):
+            sweep(experiments, "sweep", seeds_per_run=1)
+        sys.path.remove("")
+    alone = tmp_path / "alone"
+    flags = "--steps 300 --eval-every 100 --eval-episodes 1 --step-start-rl 100 --pretrain-updates 5 --seed 1"
+    cli.main(f"train sac-mlp pendulum-v {flags} --out {alone}".split())
+    name = "sac-mlp-pendulum-v-step_start_rl=100-pretrain_updates=5-seed1"
+    assert (tmp_path / "sweep" / name / "metrics" / "seed-1.jsonl").read_text() == (
+        alone / "metrics" / "seed-1.jsonl"
+    ).read_text()
+
+
+@pytest.mark.slow
+def test_a_sweep_that_was_stopped_goes_on_where_it_was(tmp_path):
+    experiments = grid(["sac-mlp"], ["pendulum-v"], seeds=2, **(QUICK | {"steps": 1500, "checkpoint_steps": 100}))
+
+    def stop(status):
+        begun = [path for path in tmp_path.glob("stopped/*/metrics/seed-0.jsonl") if '"update"' in path.read_text()]
+        if begun:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(Stopped):
+        sweep(experiments, tmp_path / "stopped", workers=1, report=stop)
+    (begun,) = (tmp_path / "stopped").glob("*seed0to1")
+    assert Run(begun).results() is None
+    assert len(sweep([], tmp_path / "stopped").finished) == 1
+    assert len(Run(begun).config["resumed"]) == 1
+    sweep(experiments, tmp_path / "whole")
+    assert rows(tmp_path / "whole" / begun.name) == rows(begun)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="Only Linux tells a process that its parent has died.")
+def test_trainings_stop_with_a_checkpoint_where_the_sweep_is_killed(tmp_path):
+    code = (
+        "import beliefrl\n"
+        f"experiments = beliefrl.grid(['sac-mlp'], ['pendulum-v'], seeds=1, **{QUICK | {'steps': 100_000}})\n"
+        f"beliefrl.sweep(experiments, {str(tmp_path / 'sweep')!r}, workers=1)\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code])
+    log = (
+        tmp_path
+        / "sweep"
+        / "sac-mlp-pendulum-v-step_start_rl=100-pretrain_updates=5-seed0"
+        / "metrics"
+        / "seed-0.jsonl"
+    )
+    while not (log.exists() and '"update"' in log.read_text()):
+        time.sleep(0.2)
+    process.kill()
+    process.wait()
+    said = tmp_path / "sweep" / "logs" / f"{log.parents[1].name}.log"
+    until = time.monotonic() + 60
+    while "beliefrl resume" not in said.read_text() and time.monotonic() < until:
+        time.sleep(0.2)
+    assert "stopped at step" in said.read_text()

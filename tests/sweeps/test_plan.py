@@ -1,0 +1,194 @@
+"""What a sweep consists of, before anything runs."""
+
+import dataclasses
+import json
+
+import pytest
+
+from beliefrl import tasks
+from beliefrl.sweeps import plan as plans
+from beliefrl.sweeps import presets
+from beliefrl.sweeps.plan import Experiment, grid, load, plan, read, shrunk, write
+from beliefrl.types import UserError
+
+
+def test_a_grid_is_every_combination():
+    made = grid(["vrm", "slac"], ["pendulum"], {"gamma": [0.9, 0.99], "tau": [0.1]}, seeds=2, steps=50)
+    assert [(each.agent, each.settings["gamma"], each.settings["tau"]) for each in made] == [
+        ("vrm", 0.9, 0.1),
+        ("vrm", 0.99, 0.1),
+        ("slac", 0.9, 0.1),
+        ("slac", 0.99, 0.1),
+    ]
+    assert all(each.settings["steps"] == 50 and each.seeds == (0, 1) for each in made)
+
+
+def test_first_seeds_come_first():
+    trainings = plan(grid(["vrm", "slac"], ["pendulum", "cartpole"], seeds=3))
+    assert [training.options["seed"] for training in trainings] == [0] * 4 + [1] * 4 + [2] * 4
+    assert len({training.name for training in trainings}) == 12
+
+
+@pytest.mark.parametrize(
+    ("agent", "task", "together", "runs"),
+    [
+        ("vrm", "pendulum", None, [[0], [1], [2], [5]]),
+        ("sac-mlp", "pendulum", None, [[0, 1, 2], [5]]),
+        ("sac-mlp", "pendulum", 1, [[0], [1], [2], [5]]),
+        ("vrm", "pendulum", 2, [[0, 1], [2], [5]]),
+        ("sac-mlp", "gym:Pendulum-v1", None, [[0], [1], [2], [5]]),
+    ],
+)
+def test_seeds_share_a_program_where_that_pays(agent, task, together, runs):
+    trainings = plan([Experiment(agent, task, seeds=(2, 0, 1, 5))], together)
+    assert [training.seeds for training in trainings] == runs
+
+
+def test_a_training_is_a_command_that_says_everything(tmp_path):
+    experiment = Experiment(
+        "vrm",
+        "cartpole",
+        {"deterministic": True, "policy_layers": [8, 8], "steps": 70, "track": ["wandb"], "target_entropy": None},
+        (3,),
+        observe=(0, 2),
+        constants={"length": 0.7},
+    )
+    (training,) = plan([experiment])
+    line = " ".join(training.command(tmp_path))
+    for part in (
+        "train vrm cartpole",
+        "--deterministic",
+        "--policy-layers 8 8",
+        "--steps 70",
+        "--track wandb",
+        "--target-entropy None",
+        "--observe 0 2",
+        "--constants length=0.7",
+        "--seed 3 --seeds 1",
+        f"--out {tmp_path / training.name} --resume",
+    ):
+        assert part in line
+    assert training.name.endswith("-seed3")
+    assert "/" not in training.name
+
+
+def test_names_tell_settings_apart_and_stay_short():
+    settings = {"gamma": [0.9, 0.99], "tau": [0.1, 0.2], "lr_actor": [1e-3], "lr_critic": [1e-3], "lr_alpha": [1e-3]}
+    settings |= {"policy_layers": [[256, 256]], "value_layers": [[256, 256]], "actor_regulariser": [0.5]}
+    names = {training.name for training in plan(grid(["sac-lstm"], ["target-reaching"], settings, seeds=1))}
+    assert len(names) == 4
+    assert all(len(name) < 140 for name in names)
+
+
+@pytest.mark.parametrize(
+    ("experiment", "phrase"),
+    [
+        (Experiment("vmr", "pendulum"), "no agent 'vmr'"),
+        (Experiment("vrm", "pendulm"), "no task 'pendulm'"),
+        (Experiment("vrm", "pendulum", {"gama": 1}), "no hyperparameter 'gama'"),
+        (Experiment("vrm", "pendulum", {"gamma": 2}), "gamma=2 is impossible"),
+        (Experiment("vrm", "pendulum", {"gamma": "much"}), "gamma=much is impossible"),
+        (Experiment("vrm", "pendulum", {"steps": 0}), "steps=0 is impossible"),
+        (Experiment("vrm", "pendulum", {"seeds": 3}), "seeds cannot be a setting"),
+        (Experiment("vrm", "pendulum", {"replay_capacity": 10}), "replay_capacity=10 is too small"),
+        (Experiment("vrm", "pendulum", observe=(7,)), "observe=(7,) does not fit"),
+        (Experiment("vrm", "pendulum", constants={"wheels": 3}), "no constant 'wheels'"),
+        (Experiment("vrm", "gym:No-v0"), "No-v0"),
+    ],
+)
+def test_every_mistake_is_found_before_anything_begins(experiment, phrase):
+    with pytest.raises(UserError) as told:
+        plan([Experiment("sac-mlp", "pendulum"), experiment])
+    assert phrase in str(told.value)
+
+
+def test_options_of_a_training_cannot_be_varied():
+    with pytest.raises(UserError, match="only hyperparameters can be varied"):
+        plan(grid(["vrm"], ["pendulum"], {"steps": [10, 20]}))
+
+
+def test_a_smaller_sweep_has_a_fraction_of_every_count():
+    small = shrunk(Experiment("vrm", "pendulum", {"steps": 30_000, "gamma": 0.9}), 0.1)
+    assert small.settings == {
+        "steps": 3000,
+        "gamma": 0.9,
+        "eval_every": 200,
+        "step_start_rl": 100,
+        "train_times_fivrm": 500,
+    }
+    assert shrunk(Experiment("slac", "pendulum", {"pretrain_updates": 0}), 0.5).settings["pretrain_updates"] == 0
+    plan([small])
+
+
+def test_what_is_written_down_is_read_again(tmp_path):
+    settings = {"policy_layers": [8], "target_entropy": None}
+    trainings = plan([Experiment("vrm", "cartpole", settings, (4,), (0, 2), {"length": 0.7})])
+    assert read(tmp_path) == []
+    write(tmp_path, trainings)
+    assert read(tmp_path) == trainings
+    (tmp_path / "sweep.json").write_text(json.dumps({"trainings": [{"name": "x"}]}))
+    with pytest.raises(UserError, match=r"sweep.json is damaged"):
+        read(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "phrase"),
+    [
+        ("experiments = 3", "makes no list `experiments`"),
+        ("x = 3", "makes no list `experiments`"),
+        ("1 / 0", "ZeroDivisionError"),
+        ("def", "SyntaxError"),
+    ],
+)
+def test_a_file_that_makes_no_experiments_is_told(tmp_path, content, phrase):
+    (tmp_path / "mine.py").write_text(content)
+    with pytest.raises(UserError, match=phrase):
+        load(tmp_path / "mine.py")
+    with pytest.raises(UserError, match="no file"):
+        load(tmp_path / "yours.py")
+
+
+def test_a_file_makes_experiments(tmp_path):
+    (tmp_path / "mine.py").write_text(
+        "import beliefrl\nexperiments = beliefrl.grid(['vrm'], ['pendulum'], seeds=[7])\n"
+    )
+    assert [training.name for training in plan(load(tmp_path / "mine.py"))] == ["vrm-pendulum-seed7"]
+
+
+@pytest.mark.parametrize(
+    ("name", "lines", "seeds"),
+    [("classic", 24, 5), ("robots", 36, 5), ("memory", 4, 5), ("ablation", 80, 5), ("scalability", 4, 1)],
+)
+def test_presets_are_the_papers_experiments(name, lines, seeds):
+    made = presets.preset(name)
+    assert len(made) == lines
+    assert all(len(each.seeds) == seeds for each in made)
+    assert {each.task for each in made} <= set(tasks.names())
+    for each in made:
+        assert each.agent in presets.COMPARED + presets.ABLATIONS
+
+
+def test_the_sensitivity_study_draws_settings_for_each_of_twenty_seeds():
+    made = presets.preset("sensitivity", ["pendulum"])
+    usual, *other = made
+    assert len(usual.seeds) == 20
+    for each in other:
+        (seed,) = each.seeds
+        assert each.settings["seq_len"] * each.settings["batch_size"] == 256
+        assert {name: each.settings[name] for name in presets.PAPERS} == presets.drawn(seed)
+    same = [seed for seed in range(20) if presets.drawn(seed) == presets.PAPERS]
+    assert len(other) == 20 - len(same)
+    assert len({tuple(presets.drawn(seed).items()) for seed in range(20)}) > 6
+    plan(made)
+
+
+def test_a_preset_takes_other_tasks_agents_and_seeds():
+    made = presets.preset("classic", ["target-reaching"], ["vrm"], [8])
+    assert [(each.agent, each.task, tuple(each.seeds)) for each in made] == [("vrm", "target-reaching", (8,))]
+    with pytest.raises(UserError, match="no preset 'paper'"):
+        presets.preset("paper")
+
+
+def test_the_options_that_a_sweep_knows_are_those_of_a_training():
+    assert {"steps", "eval_every", "track"} < set(plans.OPTIONS)
+    assert dataclasses.is_dataclass(plans.Options)

@@ -1,0 +1,145 @@
+"""The loop of a sweep, with trainings that end at once; the real ones are in the slow tests."""
+
+import json
+import os
+import signal
+
+import pytest
+
+from beliefrl import sweep
+from beliefrl.stop import Stopped
+from beliefrl.sweeps import run as runs
+from beliefrl.sweeps.plan import Experiment, grid
+from beliefrl.types import UserError
+
+TWO = grid(["vrm"], ["pendulum", "cartpole"], seeds=2, steps=10)
+
+
+class Pretence:
+    """Trainings that are over when they are looked at: finished, or failed where their name says so."""
+
+    fails = ""
+    started = []
+    most = 0
+
+    def __init__(self, folder, slots):
+        self.folder, self.slots, self.running = folder, slots, {}
+
+    @property
+    def room(self):
+        return len(self.slots) - len(self.running)
+
+    def start(self, training):
+        assert self.room > 0
+        self.running[training.name] = training
+        Pretence.started.append(training.name)
+        Pretence.most = max(Pretence.most, len(self.running))
+
+    def ended(self):
+        codes = {}
+        for name, training in self.running.items():
+            failed = self.fails and self.fails in name
+            (self.folder / "logs" / f"{name}.log").write_text("beliefrl: it broke.\n" if failed else "")
+            if not failed:
+                self.finish(training)
+            codes[name] = 2 if failed else 0
+        self.running = {}
+        return codes
+
+    def finish(self, training):
+        folder = self.folder / training.name
+        folder.mkdir(exist_ok=True)
+        rest = {"hyperparameters": {}, "task": "", "constants": {}, "options": {"seed": 0, "seeds": 1}}
+        (folder / "config.json").write_text(json.dumps({"agent": "vrm", **rest}))
+        (folder / "results.json").write_text(json.dumps({"step": training.steps}))
+
+    def stop(self):
+        self.running = {}
+
+
+@pytest.fixture(autouse=True)
+def pretend(monkeypatch):
+    monkeypatch.setattr(runs.local, "Local", Pretence)
+    monkeypatch.setattr(runs.local, "slots", lambda workers: ["0", "1", "2"][:workers])
+    monkeypatch.setattr(runs, "LOOK_EVERY", 0.0)
+    monkeypatch.setattr(Pretence, "fails", "")
+    monkeypatch.setattr(Pretence, "started", [])
+    monkeypatch.setattr(Pretence, "most", 0)
+
+
+def test_everything_is_done_as_many_at_a_time_as_there_is_room(tmp_path):
+    status = sweep(TWO, tmp_path, workers=3)
+    assert len(status.finished) == 4
+    assert Pretence.most == 3
+    assert Pretence.started[:2] == ["vrm-pendulum-seed0", "vrm-cartpole-seed0"]
+
+
+def test_what_is_finished_is_not_done_again(tmp_path):
+    sweep(TWO, tmp_path)
+    Pretence.started.clear()
+    more = grid(["vrm"], ["pendulum", "cartpole"], seeds=3, steps=10)
+    assert len(sweep(more, tmp_path).finished) == 6
+    assert Pretence.started == ["vrm-pendulum-seed2", "vrm-cartpole-seed2"]
+
+
+def test_a_sweep_can_be_made_longer(tmp_path):
+    sweep(TWO, tmp_path)
+    Pretence.started.clear()
+    sweep(grid(["vrm"], ["pendulum"], seeds=1, steps=20), tmp_path)
+    assert Pretence.started == ["vrm-pendulum-seed0"]
+
+
+def test_a_failure_is_told_and_the_others_go_on(tmp_path, monkeypatch):
+    monkeypatch.setattr(Pretence, "fails", "pendulum-seed0")
+    with pytest.raises(UserError, match=r"1 of 4 trainings failed, such as vrm-pendulum-seed0 \(it broke\)"):
+        sweep(TWO, tmp_path)
+    assert len(Pretence.started) == 4
+    Pretence.started.clear()
+    monkeypatch.setattr(Pretence, "fails", "")
+    sweep([], tmp_path)  # its plan is in its folder
+    assert Pretence.started == ["vrm-pendulum-seed0"]
+
+
+def test_a_sweep_that_is_stopped_says_how_to_go_on(tmp_path):
+    def stop(status):
+        if len(status.finished) == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(Stopped, match=r"stopped with 2 of 4 trainings finished; `beliefrl sweep --out") as stopped:
+        sweep(TWO, tmp_path, workers=2, report=stop)
+    assert stopped.value.exit_code == 130
+    assert len(sweep([], tmp_path).finished) == 4
+    assert len(Pretence.started) == 4
+
+
+def test_two_processes_cannot_run_one_sweep(tmp_path):
+    def again(status):
+        with pytest.raises(UserError, match="is being swept by process"):
+            sweep(TWO, tmp_path)
+
+    sweep(TWO, tmp_path, report=again)
+
+
+def test_nothing_is_made_where_a_name_is_wrong(tmp_path):
+    with pytest.raises(UserError, match="no agent"):
+        sweep([Experiment("vmr", "pendulum")], tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_folder_that_cannot_be_made_is_told(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="cannot be made"):
+        sweep(TWO, tmp_path / "file" / "sweep")
+
+
+@pytest.mark.parametrize(
+    ("log", "why"),
+    [
+        ("step 1\nbeliefrl: It broke: mend it.\n", "It broke: mend it."),
+        ("Traceback\n  line\nValueError: odd\n", "ValueError: odd"),
+        ("", "it ended with code -9 and said nothing"),
+    ],
+)
+def test_the_reason_of_a_failure_is_the_last_thing_that_was_said(tmp_path, log, why):
+    (tmp_path / "log").write_text(log)
+    assert runs.reason(tmp_path / "log", -9) == why
