@@ -29,10 +29,12 @@ html_css_files = ["style.css"]
 html_show_sourcelink = html_copy_source = False
 highlight_language = "none"  # a block without a language is plain text
 
+smartquotes = False
 default_role = "code"  # a word in backticks is code in docstrings, as it is in Markdown
 add_module_names = False
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
-autodoc_default_options = {"members": True, "show-inheritance": False}
+autoclass_content = "both"
+autodoc_default_options = {"members": True}
 python_use_unqualified_type_names = True
 maximum_signature_line_length = 90

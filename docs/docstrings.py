@@ -26,7 +26,8 @@ def setup(app: Sphinx) -> dict[str, Any]:
 
 def rewrite(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
     """Turn a docstring into reStructuredText, in place."""
-    if lines and lines[0].startswith("Alias for field number"):
+    lines[:] = [line for line in lines if not line.startswith("Create new instance of ")]  # NamedTuple's own
+    if lines and lines[0].startswith("Alias for field number "):
         lines[:] = [comments(name).get(name.rpartition(".")[2], "")]
     elif what != "attribute":
         lines[:] = GoogleDocstring(list(literal(lines)), Config(), app, what, name, obj, options).lines()
@@ -43,6 +44,8 @@ def literal(lines: list[str]) -> Iterator[str]:
         elif indented and not (before or section or inside):
             inside = True
             yield from ("::", "")
+        if before == "Returns:":
+            line = f"    : {line.strip()}"  # else what stands before its first colon is taken for a type
         yield line
 
 
