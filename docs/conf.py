@@ -32,6 +32,7 @@ highlight_language = "none"  # a block without a language is plain text
 smartquotes = False
 default_role = "code"  # a word in backticks is code in docstrings, as it is in Markdown
 add_module_names = False
+toc_object_entries_show_parents = "hide"
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
 autoclass_content = "both"
