@@ -1,0 +1,121 @@
+"""The pages name commands, options, tasks and agents that exist, and say of tasks what the code says."""
+
+import contextlib
+import dataclasses
+import functools
+import io
+import pathlib
+import re
+
+import pytest
+
+import beliefrl
+from beliefrl import agents, tasks
+from beliefrl.cli import COMMANDS, main
+from beliefrl.tasks import registered
+
+ROOT = pathlib.Path(__file__).parent.parent
+DOCS = ROOT / "docs"
+PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md")])
+WRITTEN_LATER = {"sweep", "figure", "predict", "film", "video", "report"}
+
+
+def command_lines(text):
+    """Every `beliefrl COMMAND ...` of a page, in its blocks and in its sentences, as words."""
+    blocks = [line for block in re.findall(r"```bash\n(.*?)```", text, re.DOTALL) for line in block.splitlines()]
+    inline = re.findall(r"`([^`\n]+)`", re.sub(r"```.*?```", "", text, flags=re.DOTALL))
+    for line in [*blocks, *inline]:
+        found = re.match(r"(?:.*[ /])?beliefrl ([a-z]+\b.*)", line.partition(" # ")[0])
+        if found:
+            yield tuple(re.split(r" (?:&|&&|\|)(?: |$)", found[1])[0].split())
+
+
+@functools.cache
+def help_of(command, *first):
+    """What `beliefrl COMMAND FIRST --help` prints; FIRST is an agent, or the word that says which of its figures."""
+    screen = io.StringIO()
+    with contextlib.redirect_stdout(screen), pytest.raises(SystemExit) as ended:
+        main([command, *first, "--help"])
+    assert ended.value.code in (0, None)
+    return screen.getvalue()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_a_page_names_commands_and_options_that_exist(page):
+    for command, *words in command_lines(page.read_text()):
+        if command in WRITTEN_LATER and command not in COMMANDS:
+            continue
+        assert command in COMMANDS, f"beliefrl {command}"
+        options = {word.partition("=")[0] for word in words if word.startswith("--")} - {"--help"}
+        named = [word for word in words[:1] if re.fullmatch(r"[a-z][\w-]*", word)]
+        if command in ("train", "bench") and named:
+            assert named[0] in (*agents.names(), *(["all"] if command == "bench" else []))
+        if command == "train":
+            assert not words[1:2] or words[1].startswith("-") or words[1].isupper() or tasks.knows(words[1])
+        if options:
+            known = set(re.findall(r"--[a-z][\w-]*", help_of(command, *named)))
+            assert options <= known, f"beliefrl {command} {' '.join(named)} has no {options - known}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_the_files_that_a_page_links_to_exist(page):
+    for target in re.findall(r"\]\(([^)#\s]+)", page.read_text()):
+        assert "://" in target or (page.parent / target).exists(), target
+
+
+def test_the_command_lines_of_a_page_are_found():
+    page = "Say `beliefrl show RUN`.\n```bash\nX=1 beliefrl train vrm ant --seeds 2 &   # twice\npip list\n```"
+    assert list(command_lines(page)) == [("train", "vrm", "ant", "--seeds", "2"), ("show", "RUN")]
+
+
+def rows(page):
+    """Of the tables of a page the rows that begin with a name: {name: the other cells}."""
+    lines = [line.split("|")[1:-1] for line in page.read_text().splitlines() if line.startswith("| `")]
+    return {name.strip(" `"): [cell.strip() for cell in cells] for name, *cells in lines}
+
+
+def entries(cell):
+    """The indices that "3, 4" or "0 to 14" stand for."""
+    first, _, last = cell.partition(" to ")
+    return tuple(range(int(first), int(last) + 1)) if last else tuple(map(int, cell.split(", ")))
+
+
+def test_the_page_of_tasks_has_every_task_as_it_is():
+    table = rows(DOCS / "tasks.md")
+    assert set(table) == {*tasks.names(), *registered.names()} - {registered.ANY}
+    for name in tasks.names():
+        _, numbers, actions, steps, indices = table[name]
+        base = re.sub("-[vp]$", "", name)
+        velocities, positions = tasks.masks(tasks.TASKS.get(base) or registered.ROBOTS[base])
+        seen = {"-v": velocities, "-p": positions}.get(name[-2:]) or tuple(sorted(velocities + positions))
+        if seen:
+            assert entries(indices) == seen, name
+        assert len(entries(indices)) == int(numbers), name
+        if base in tasks.TASKS:
+            assert tasks.make(name).spec[:3] == (int(numbers), int(actions), int(steps)), name
+    for known in registered.GYMNASIUMS:
+        _, velocities, numbers = table[registered.PREFIX + known.id]
+        assert entries(velocities) == known.velocities
+        assert int(numbers) == len(known.velocities + known.positions)
+
+
+def test_the_page_of_tasks_has_every_constant():
+    text = (DOCS / "tasks.md").read_text()
+    for task in tasks.TASKS.values():
+        for constant in dataclasses.fields(task):
+            assert f"`{constant.name}`" in text
+
+
+def test_the_page_of_agents_has_every_agent():
+    text = (DOCS / "agents" / "README.md").read_text()
+    assert all(f"`{name}`" in text for name in agents.names())
+
+
+def test_every_public_name_is_in_the_api():
+    listed = set(re.findall(r"^\.\. auto\w+:: (\w+)$", (DOCS / "api.md").read_text(), re.MULTILINE))
+    assert listed == set(beliefrl.__all__)
+
+
+def test_every_example_is_shown():
+    shown = re.findall(r"{literalinclude} \.\./examples/(\S+)", (DOCS / "examples.md").read_text())
+    assert sorted(shown) == sorted(path.name for path in (ROOT / "examples").glob("*.py"))
