@@ -40,9 +40,7 @@ def test_a_training_that_fails_frees_its_core_and_says_why(tmp_path):
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="This system cannot choose cores.")
 def test_a_worker_runs_on_its_core():
     core = max(os.sched_getaffinity(0))
-    code = (
-        f"import os; from beliefrl import worker; worker.main(['{core}', '--version']); print(os.sched_getaffinity(0))"
-    )
+    code = f"import os, beliefrl.worker as w; w.main(['{core}', '--version']); print(os.sched_getaffinity(0))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert out.splitlines()[-1] == f"{{{core}}}"
 
@@ -143,7 +141,7 @@ def test_trainings_stop_with_a_checkpoint_where_the_sweep_is_killed(tmp_path):
         time.sleep(0.2)
     process.kill()
     process.wait()
-    said = tmp_path / "sweep" / "logs" / f"{log.parents[1].name}.log"
+    said = tmp_path / "sweep" / "logs" / f"{name}.log"
     until = time.monotonic() + 60
     while "beliefrl resume" not in said.read_text() and time.monotonic() < until:
         time.sleep(0.2)

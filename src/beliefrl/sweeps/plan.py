@@ -118,7 +118,7 @@ def grid(
 def shrunk(experiment: Experiment, scale: float) -> Experiment:
     """The same with `scale` times the steps, the exploration, the pre-training and the steps between evaluations."""
     hyperparameters, options = _split(experiment.settings)
-    agent: Any = agents.make(experiment.agent, **_tuples(hyperparameters))
+    agent: Any = _agent(experiment.agent, hyperparameters)
     counts = {name: value for name, value in dataclasses.asdict(agent).items() if name in SHRINKS}
     counts |= {name: options.get(name, getattr(Options, name)) for name in ("steps", "eval_every")}
     smaller = {name: max(10, round(count * scale)) if count else 0 for name, count in counts.items()}
@@ -141,9 +141,7 @@ def plan(experiments: Iterable[Experiment], seeds_per_run: int | None = None) ->
         for turn, (first, count) in enumerate(_stretches(experiment, seeds_per_run)):
             training = _training(experiment, first, count)
             if planned.setdefault(training.name, training) != training:
-                raise UserError(
-                    f"Two trainings would be called {training.name}: options of trainings cannot be varied."
-                )
+                raise UserError(f"Two trainings would be called {training.name}: only hyperparameters can be varied.")
             turns[training.name] = turn
     _check(planned.values())
     return sorted(planned.values(), key=lambda training: turns[training.name])
@@ -200,16 +198,26 @@ def _check(trainings: Iterable[Training]) -> None:
     """Find every mistake before anything begins."""
     made: dict[str, Any] = {}
     for training in trainings:
-        agent = agents.make(training.agent, **_tuples(training.settings))
-        capacity(agent, Options(**training.options))
+        agent = _agent(training.agent, training.settings)
+        capacity(agent, Options(**_typed(training.options, Options)))
         key = json.dumps([training.task, training.observe, training.constants], sort_keys=True, default=str)
         if key not in made:
             made[key] = tasks.make(training.task, training.observe or None, **training.constants).spec
 
 
-def _tuples(values: dict[str, Any]) -> dict[str, Any]:
-    """JSON's lists as the tuples they stand for."""
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+def _agent(name: str, hyperparameters: dict[str, Any]) -> Any:
+    return agents.make(name, **_typed(hyperparameters, agents.find(name)))
+
+
+def _typed(values: dict[str, Any], like: Any) -> dict[str, Any]:
+    """JSON's lists as the tuples they stand for, and whole numbers as floats where `like` has a float."""
+
+    def typed(name: str, value: Any) -> Any:
+        if isinstance(value, int) and not isinstance(value, bool) and isinstance(getattr(like, name, None), float):
+            return float(value)
+        return tuple(value) if isinstance(value, list) else value
+
+    return {name: typed(name, value) for name, value in values.items()}
 
 
 def _flag(name: str, value: Any) -> list[str]:

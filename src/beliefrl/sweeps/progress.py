@@ -16,8 +16,9 @@ class Progress:
     def __init__(self, folder: pathlib.Path, training: Training):
         """`folder` is the sweep's."""
         self.training, self._path = training, folder / training.name
-        self.began, self.first_step = time.monotonic(), None
         self.step, self.doing, self.last_return = 0, "starting", None
+        self.read()
+        self.began, self._first_step = time.monotonic(), self.step  # of a training that goes on, where it was
 
     def read(self) -> None:
         """Look again at what is new."""
@@ -34,13 +35,11 @@ class Progress:
                 self.doing = "learning"
             elif row["kind"] == "evaluation":
                 self.last_return = statistics.fmean(row["sampled"])
-        if rows and self.first_step is None:
-            self.first_step = self.step if self.step > self.training.steps // 100 else 0
 
     @property
     def seconds_per_step(self) -> float | None:
         """Of all its seeds together since it was started; None before a tenth of it is done."""
-        done = self.step - (self.first_step or 0)
+        done = self.step - self._first_step
         return (time.monotonic() - self.began) / done if done >= self.training.steps / 10 else None
 
 

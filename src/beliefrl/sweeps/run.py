@@ -115,10 +115,8 @@ def _loop(folder: pathlib.Path, status: Status, launcher: Launcher, report: Repo
         report(status)
         if requests.number:
             launcher.stop()
-            again = f"`beliefrl sweep --out {folder}` goes on from there."
-            raise Stopped(
-                f"stopped; {len(status.finished)} of {status.count} trainings are finished; {again}", requests.number
-            )
+            told = f"stopped with {len(status.finished)} of {status.count} trainings finished"
+            raise Stopped(f"{told}; `beliefrl sweep --out {folder}` goes on from there.", requests.number)
         time.sleep(LOOK_EVERY)
 
 
