@@ -51,7 +51,7 @@ def figure(argv: Sequence[str]) -> None:
         raise UsageError(f"{given}: write beliefrl figure KIND RUNS, where KIND is {', '.join(KINDS)}.")
     kind = argv[0]
     options = parse(FigureOptions, argv[1:], f"beliefrl figure {kind}")
-    groups = _groups(options, kind)
+    groups, left_out = _groups(options, kind)
     out = options.out or pathlib.Path(kind)
 
     from beliefrl.analysis import aggregate, elbo, panels, scalability
@@ -68,11 +68,13 @@ def figure(argv: Sequence[str]) -> None:
         path = panels.draw_curves(panels.pooled(groups, presets.drawn, presets.PAPERS), out, options.actions)
     else:
         path = panels.draw_curves(groups, out, options.actions)
+    for folder in left_out:
+        print(f"left out: {folder} is not finished (--unfinished draws it as far as it has come)")
     print(f"written to {path} and {path.with_suffix('.tex' if kind == 'scalability' else '.pdf').name}")
 
 
-def _groups(options: FigureOptions, kind: str) -> list:
-    """The chosen runs' lines; says which were left out."""
+def _groups(options: FigureOptions, kind: str) -> tuple[list, list[pathlib.Path]]:
+    """The chosen runs' lines, and the folders of those that were left out."""
     from beliefrl.analysis import groups
     from beliefrl.types import UserError
 
@@ -83,10 +85,7 @@ def _groups(options: FigureOptions, kind: str) -> list:
     chosen = [run for run in chosen if not options.agents or run.config["agent"] in options.agents]
     if kind == "ablation":
         chosen = [run for run in chosen if run.config["agent"].startswith("vrm")]
-    finished = [run for run in chosen if options.unfinished or groups.is_finished(run)]
-    for run in chosen:
-        if run not in finished:
-            print(f"left out: {run.folder} is not finished (--unfinished draws it as far as it has come)")
-    if not finished:
+    drawn = [run for run in chosen if options.unfinished or groups.is_finished(run)]
+    if not drawn:
         raise UserError(f"None of the {len(found)} runs can be drawn: none that was asked for is finished.")
-    return groups.groups(finished)
+    return groups.groups(drawn), [run.folder for run in chosen if run not in drawn]

@@ -127,9 +127,10 @@ def _with_settings(experiments: list, options: SweepOptions) -> list:
 
 
 def _named(given: str) -> tuple[str, str]:
-    name, _, value = given.partition("=")
-    named_values([given], "--set")  # complains of what is no NAME=VALUE
-    return name.replace("-", "_"), value
+    name, separator, value = given.partition("=")
+    name = name.replace("-", "_")
+    named_values([name + separator + value], "--set")  # complains of what is no NAME=VALUE
+    return name, value
 
 
 def _values(text: str) -> list:
