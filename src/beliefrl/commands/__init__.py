@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
-from beliefrl.commands import bench, lists, runs, training
+from beliefrl.commands import bench, lists, report, runs, training
 
 COMMANDS: dict[str, Callable[[Sequence[str]], None]] = {
     "train": training.train,
@@ -10,6 +10,7 @@ COMMANDS: dict[str, Callable[[Sequence[str]], None]] = {
     "show": runs.show,
     "evaluate": runs.evaluate,
     "export": runs.export,
+    "report": report.report,
     "tasks": lists.list_tasks,
     "agents": lists.list_agents,
     "bench": bench.bench,
