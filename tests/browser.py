@@ -8,9 +8,13 @@ import pathlib
 import select
 import shutil
 import subprocess
+import sys
 import tempfile
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+# Chromium reads from the file 3 and writes to 4; a process that becomes it, since a fork would disturb JAX's threads
+FROM_3_TO_4 = "import os, sys; [os.dup2(int(sys.argv[i]), i + 2) for i in (1, 2)]; os.execv(sys.argv[3], sys.argv[3:])"
 
 
 class Page:
@@ -19,11 +23,11 @@ class Page:
     def __init__(self, path, width=1280, height=900, mobile=False, scheme="light"):
         read, self._to = os.pipe()
         from_it, write = os.pipe()
-        self._home = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+        self._home = tempfile.mkdtemp()
         options = ["--headless", "--no-sandbox", "--hide-scrollbars", "--disable-gpu", "--disable-dev-shm-usage"]
-        options += ["--remote-debugging-pipe", f"--user-data-dir={self._home.name}"]
+        options += ["--remote-debugging-pipe", f"--user-data-dir={self._home}"]
         self._browser = subprocess.Popen(
-            ["sh", "-c", f'exec "$0" "$@" 3<&{read} 4>&{write}', str(CHROMIUM), *options, "about:blank"],
+            [sys.executable, "-c", FROM_3_TO_4, str(read), str(write), str(CHROMIUM), *options, "about:blank"],
             pass_fds=(read, write), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
         os.close(read)
@@ -50,7 +54,7 @@ class Page:
         self._browser.kill()
         self._browser.wait()
         self._from.close()
-        self._home.cleanup()
+        shutil.rmtree(self._home, ignore_errors=True)
 
     def _ask(self, method, **parameters):
         number = next(self._numbers)

@@ -16,6 +16,7 @@ from beliefrl.analysis.curves import draw_curve
 from beliefrl.environment import TaskEnvironment, register
 from beliefrl.evaluation import evaluate, task_of
 from beliefrl.policy import Policy, load
+from beliefrl.report import write_report
 from beliefrl.runs import Run
 from beliefrl.schedule import Event, Options
 from beliefrl.stop import Stopped
@@ -53,4 +54,5 @@ __all__ = [
     "resume",
     "task_of",
     "train",
+    "write_report",
 ]
