@@ -140,6 +140,12 @@ def test_time_is_the_sum_of_all_sessions(tmp_path):
     assert [run["seconds"] for run in told(tmp_path)["runs"]] == [7200.0, None, None]
 
 
+def test_the_plain_agents_line_is_not_dashed(tmp_path):
+    a_run(tmp_path / "a", TWO_SEEDS, hyperparameters={"gamma": 0.9})
+    a_run(tmp_path / "b", TWO_SEEDS, hyperparameters={})
+    assert [(label["name"], label["dash"]) for label in told(tmp_path)["labels"]] == [("vrm gamma=0.9", 1), ("vrm", 0)]
+
+
 def test_settings_are_those_that_differ_from_the_agents(tmp_path):
     a_run(tmp_path / "a", TWO_SEEDS, hyperparameters={"gamma": 0.99, "d_size": 7, "policy_layers": [256, 256]})
     a_run(tmp_path / "b", TWO_SEEDS, agent="vrm-single", hyperparameters={"models": "single"})
@@ -210,7 +216,7 @@ def a_page(tmp_path_factory):
     a_run(folder / "a", TWO_SEEDS, **HOUR)
     a_run(folder / "b", TWO_SEEDS[:1], agent="slac", hyperparameters={"gamma": 0.5})
     a_run(folder / "c", success, task="target-reaching")
-    a_run(folder / "d", TWO_SEEDS, agent=EVIL, task=EVIL, command=[EVIL])
+    a_run(folder / "d", TWO_SEEDS, agent=EVIL, task=EVIL, command=[EVIL, "a b"])
     a_run(folder / "e", [TWO_SEEDS[0][:1]], agent="sac-mlp")
     (folder / "d" / "curve.png").write_bytes(b"")
     return write_report([folder], folder / "page.html")
@@ -287,10 +293,11 @@ def test_an_opened_run_shows_its_configuration_as_text(opened):
         opened.run(f"{each}.querySelector('summary').click()")
     opened.frame()
     assert "gamma=0.5" in opened.run(f"{other}.innerText")
+    assert opened.run(f"{run}.querySelector('dl code').innerText") == f"'{EVIL}' 'a b'"
     assert json.loads(opened.run(f"{run}.querySelector('pre').textContent"))["task"] == EVIL
     assert opened.run(f"{run}.querySelector('.media a').getAttribute('href')") == "d/curve.png"
     assert opened.run("document.querySelectorAll('[onerror]').length") == 0
-    opened.requests.pop()  # the picture
+    opened.requests = [address for address in opened.requests if not address.endswith("/d/curve.png")]
 
 
 @browser_test

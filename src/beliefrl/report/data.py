@@ -53,7 +53,8 @@ def told(runs: Sequence[Run], beside: pathlib.Path, unfinished: bool = False) ->
     of = {(run.folder, seed): index for index, group in enumerate(lines) for run, seed in group.seeds}
     palette = colours([group.label for group in lines])
     agent_of = {group.label: group.agent for group in lines}
-    of_agent = {agent: [label for label in palette if agent_of[label] == agent] for agent in agent_of.values()}
+    plain_first = sorted(palette, key=lambda label: label != agent_of[label])
+    of_agent = {agent: [label for label in plain_first if agent_of[label] == agent] for agent in agent_of.values()}
     return {
         "tasks": list(dict.fromkeys(group.task for group in lines)),
         "labels": [

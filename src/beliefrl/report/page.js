@@ -78,7 +78,7 @@ function finalColumns() {
       ([seed, step]) => `seed ${seed} diverged by step ${whole(step)}`,
     );
     const notes = [...diverged, ...(group.unfinished ? ["not finished"] : [])];
-    return html("span", {}, String(group.seeds.length), notes.length ? html("small", {}, notes.join("; ")) : null);
+    return html("span", {}, String(group.seeds.length), notes.length ? html("small", { class: "wide" }, notes.join("; ")) : null);
   };
   const column = (heading, name, rate) => [heading, (group) => group.final[name]?.mean, cell(name, rate), true];
   return [
