@@ -16,6 +16,7 @@ from beliefrl.analysis.curves import draw_curve
 from beliefrl.environment import TaskEnvironment, register
 from beliefrl.evaluation import evaluate, task_of
 from beliefrl.policy import Policy, load
+from beliefrl.report import write_report
 from beliefrl.runs import Run
 from beliefrl.schedule import Event, Options
 from beliefrl.stop import Stopped
@@ -58,4 +59,5 @@ __all__ = [
     "sweep",
     "task_of",
     "train",
+    "write_report",
 ]

@@ -19,6 +19,7 @@ Reinforcement learning for agents that do not see the whole state.
   beliefrl show RUN             what a run was made with, how far it is, and what it is worth
   beliefrl evaluate RUN         play new episodes with what a run has learned
   beliefrl export RUN FILE      write the learned policy as one file that jax loads without this library
+  beliefrl report RUNS          one page for the browser: curves, final returns, settings, time
   beliefrl tasks                list the tasks
   beliefrl agents               list the agents
   beliefrl bench AGENT          time a training step on this machine, part by part; `all` compares the agents

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
-from beliefrl.commands import bench, figure, lists, runs, sweep, training
+from beliefrl.commands import bench, figure, lists, report, runs, sweep, training
 
 COMMANDS: dict[str, Callable[[Sequence[str]], None]] = {
     "train": training.train,
@@ -12,6 +12,7 @@ COMMANDS: dict[str, Callable[[Sequence[str]], None]] = {
     "show": runs.show,
     "evaluate": runs.evaluate,
     "export": runs.export,
+    "report": report.report,
     "tasks": lists.list_tasks,
     "agents": lists.list_agents,
     "bench": bench.bench,

@@ -1,0 +1,196 @@
+"""What a report tells of runs, as plain values that are written as JSON: what is not a finite number becomes None."""
+
+import dataclasses
+import json
+import os
+import pathlib
+import shlex
+from collections.abc import Iterator, Sequence
+from datetime import datetime
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+
+from beliefrl import agents
+from beliefrl.analysis.curves import standard_error
+from beliefrl.analysis.groups import Curve, Group, groups, is_finished, last_step
+from beliefrl.analysis.palette import colours
+from beliefrl.evaluation import MODES
+from beliefrl.runs import Row, Run
+from beliefrl.types import UserError
+
+MEDIA = (".mp4", ".webm", ".gif")
+PICTURE = "curve.png"
+INTERVAL = 0.95
+
+
+class ReadOnce(Run):
+    """A run whose logs are read once, not for every question: of what a report asks for, its kinds of entries."""
+
+    KINDS = ("evaluation", "diverged")
+
+    def __init__(self, folder: str | os.PathLike[str]):
+        super().__init__(folder)
+        self._rows: dict[int, list[Row]] = {}
+
+    def rows(self, seed: int, kind: str | None = None) -> Iterator[Row]:
+        if kind not in self.KINDS:
+            return super().rows(seed, kind)
+        if seed not in self._rows:
+            self._rows[seed] = [row for row in super().rows(seed) if row["kind"] in self.KINDS]
+        return (row for row in self._rows[seed] if row["kind"] == kind)
+
+
+def told(runs: Sequence[Run], beside: pathlib.Path, unfinished: bool = False) -> dict[str, Any]:
+    """All that the page shows of `runs`; files in them are named as seen from the folder `beside`.
+
+    Curves and final returns are of runs that are finished; with `unfinished` also of others of which each seed has an
+    evaluation, and the curve of a group then ends where its shortest seed does.
+    """
+    counted = [run for run in runs if is_finished(run) or (unfinished and _has_begun(run))]
+    lines = [group for group in groups(counted) if group.curve().steps.size]
+    of = {(run.folder, seed): index for index, group in enumerate(lines) for run, seed in group.seeds}
+    palette = colours([group.label for group in lines])
+    agent_of = {group.label: group.agent for group in lines}
+    plain_first = sorted(palette, key=lambda label: label != agent_of[label])
+    of_agent = {agent: [label for label in plain_first if agent_of[label] == agent] for agent in agent_of.values()}
+    return {
+        "tasks": list(dict.fromkeys(group.task for group in lines)),
+        "labels": [
+            {"name": label, "colour": colour, "dash": of_agent[agent_of[label]].index(label)}
+            for label, colour in palette.items()
+        ],
+        "groups": [_group(group) for group in lines],
+        "runs": [_run(run, beside, {seed: of.get((run.folder, seed)) for seed in run.seeds}) for run in runs],
+    }
+
+
+def _has_begun(run: Run) -> bool:
+    return all(last_step(run, seed) > 0 for seed in run.seeds)
+
+
+def _group(group: Group) -> dict[str, Any]:
+    names = [mode + suffix for suffix in ("", "_success") if not suffix or group.has_success for mode in MODES]
+    curves = {name: group.curve(name) for name in names}
+    diverged = {seed: row["step"] for run, seed in group.seeds for row in run.rows(seed, "diverged")}
+    return {
+        "task": group.task,
+        "label": group.label,
+        "seeds": [seed for _, seed in group.seeds],
+        "diverged": diverged,
+        "unfinished": not all(map(is_finished, group.runs)),
+        "steps": int(group.curve().steps[-1]),
+        "curves": {name: _curve(curve) for name, curve in curves.items()},
+        "final": {
+            name: statistics(curve.seeds[:, -1] if len(diverged) < len(group.seeds) else np.array([]))
+            for name, curve in curves.items()
+            if curve.steps.size
+        },
+    }
+
+
+def _curve(curve: Curve) -> dict[str, Any]:
+    """A curve's steps, each seed's values, and mean, S.E.M. and number of seeds at each step."""
+    columns = [statistics(column) for column in curve.seeds.T]
+    return {
+        "steps": curve.steps.tolist(),
+        "seeds": [[number(value) for value in seed] for seed in curve.seeds],
+        **{name: [column[name] for column in columns] for name in ("mean", "sem", "count")},
+    }
+
+
+def statistics(seeds: np.ndarray) -> dict[str, Any]:
+    """Mean, S.E.M. and Student's 95 % interval for the mean over those seeds (seed,) that are finite numbers.
+
+    S.E.M. and interval are None for one seed, all but `count` for none.
+    """
+    there = seeds[np.isfinite(seeds)]
+    if there.size < 2:
+        return {"count": there.size, "mean": number(there[0]) if there.size else None, "sem": None, "interval": None}
+    from scipy.special import stdtrit
+
+    mean, error = float(there.mean()), float(standard_error(there))
+    half = float(stdtrit(there.size - 1, (1 + INTERVAL) / 2)) * error
+    return {
+        "count": there.size,
+        "mean": number(mean),
+        "sem": number(error),
+        "interval": [number(mean - half), number(mean + half)],
+    }
+
+
+def number(value: float) -> float | None:
+    """To seven significant digits; None where it is not finite, for which JSON has no word."""
+    return float(f"{value:.7g}") if np.isfinite(value) else None
+
+
+def _run(run: Run, beside: pathlib.Path, groups_of: dict[int, int | None]) -> dict[str, Any]:
+    config = run.config
+    sessions = [each for each in (config, *_list(config.get("resumed"))) if isinstance(each, dict)]
+    lasted = [_seconds(session) for session in sessions]
+    seconds = None if None in lasted else sum(filter(None, lasted))
+    steps = {seed: last_step(run, seed) for seed in run.seeds}
+    return {
+        "folder": str(run.folder),
+        "agent": config["agent"],
+        "task": config["task"],
+        "group": next((index for index in groups_of.values() if index is not None), None),
+        "not_counted": [seed for seed, index in groups_of.items() if index is None],
+        "finished": is_finished(run),
+        "seeds": run.seeds,
+        "steps": max(steps.values(), default=0),
+        "of": config["options"].get("steps"),
+        "diverged": [f"seed {seed}: {row.get('why')}" for seed in run.seeds for row in run.rows(seed, "diverged")],
+        "seconds": seconds,
+        "settings": settings(config),
+        "sessions": [_session(session) for session in sessions],
+        "config": json.dumps(config, indent=2),
+        "media": [_seen_from(beside, path) for path in _media(run.folder)],
+    }
+
+
+def settings(config: dict[str, Any]) -> list[str] | None:
+    """NAME=VALUE of the hyperparameters that are not the agent's own; None where this version has no such agent."""
+    try:
+        own = json.loads(json.dumps(dataclasses.asdict(agents.find(config["agent"]))))
+    except UserError:
+        return None
+    missing = object()
+    given = config["hyperparameters"]
+    return [f"{name}={value}" for name, value in given.items() if own.get(name, missing) != value]
+
+
+def _session(session: dict[str, Any]) -> dict[str, str]:
+    """How a training was started or gone on with, in words."""
+    versions = session.get("versions")
+    return {
+        "started": str(session.get("started", "?")),
+        "ended": str(session.get("ended", "?")),
+        "device": str(session.get("device", "?")),
+        "commit": str(session.get("git_commit") or "?"),
+        "command": shlex.join(map(str, _list(session.get("command")))),
+        "versions": ", ".join(f"{name} {of}" for name, of in versions.items()) if isinstance(versions, dict) else "?",
+    }
+
+
+def _seconds(session: dict[str, Any]) -> float | None:
+    """How long a process had the run; None if it was killed before it could write that down."""
+    try:
+        began, ended = (datetime.fromisoformat(session[name]) for name in ("started", "ended"))
+        return (ended - began).total_seconds()
+    except (KeyError, TypeError, ValueError):
+        return None
+
+
+def _list(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else []
+
+
+def _media(folder: pathlib.Path) -> list[pathlib.Path]:
+    return sorted(path for path in folder.rglob("*") if path.suffix in MEDIA or path == folder / PICTURE)
+
+
+def _seen_from(folder: pathlib.Path, path: pathlib.Path) -> dict[str, str]:
+    """A file's name, and its address relative to a page in `folder`."""
+    return {"name": path.name, "address": quote(os.path.relpath(path, folder).replace(os.sep, "/"))}

@@ -1,0 +1,207 @@
+// What is shown
+
+const form = at("filters");
+const chosen = (name) => new Set([...form.querySelectorAll(`[name=${name}]:checked`)].map((box) => box.value));
+function shown() {
+  const [labels, tasks] = [chosen("label"), chosen("task")];
+  return {
+    name: form.elements.mode.value + form.elements.entry.value,
+    rate: form.elements.entry.value !== "",
+    seeds: form.elements.seeds.checked,
+    group: (group) => labels.has(group.label) && tasks.has(group.task),
+  };
+}
+function chips(fieldset, name, values, mark) {
+  const boxes = values.map((value) => html("input", { type: "checkbox", name, value, checked: true }));
+  fieldset.append(...boxes.map((box) => html("label", { class: "chip" }, box, mark(box.value), box.value)));
+  if (values.length < 3) return;
+  for (const [word, checked] of [
+    ["all", true],
+    ["none", false],
+  ]) {
+    const change = () => (boxes.forEach((box) => (box.checked = checked)), update());
+    fieldset.append(html("button", { type: "button", "aria-label": `${word} ${name}s`, onclick: change }, word));
+  }
+}
+
+// Tables: columns are [heading, value to sort by, cell or null for the value itself, whether a number]
+
+function table(element, columns, entries) {
+  const rows = entries.map((entry) => {
+    const cells = columns.map(([, value, cell, numeric], i) =>
+      html(i ? "td" : "th", { class: numeric && "number", scope: !i && "row" }, (cell ?? value)(entry) ?? "–"),
+    );
+    return { entry, element: html("tr", {}, cells) };
+  });
+  const body = html("tbody");
+  body.append(...rows.map((row) => row.element));
+  const heads = columns.map(([heading, value, , numeric]) => {
+    const sort = () => {
+      const again = head.getAttribute("aria-sort") === (numeric ? "descending" : "ascending");
+      const down = again ? !numeric : numeric;
+      heads.forEach((other) => other.removeAttribute("aria-sort"));
+      head.setAttribute("aria-sort", down ? "descending" : "ascending");
+      const order = (a, b) =>
+        a == null ? 1 : b == null ? -1 : (down ? -1 : 1) * (numeric ? a - b : String(a).localeCompare(String(b)));
+      body.append(...rows.sort((a, b) => order(value(a.entry), value(b.entry))).map((row) => row.element));
+    };
+    const head = html(
+      "th",
+      { class: numeric && "number", scope: "col" },
+      html("button", { type: "button", onclick: sort }, heading),
+    );
+    return head;
+  });
+  element.replaceChildren(html("thead", {}, html("tr", {}, heads)), body);
+  return rows;
+}
+function finalColumns() {
+  const rates = data.groups.some((group) => group.final.sampled_success);
+  const best = (name, task) =>
+    Math.max(
+      ...data.groups.filter((group) => group.task === task).map((group) => group.final[name]?.mean ?? -Infinity),
+    );
+  const several = (task) => data.groups.filter((group) => group.task === task).length > 1;
+  const cell = (name, rate) => (group) => {
+    const final = group.final[name];
+    if (!final || final.mean == null) return "–";
+    const told = withError(final.mean, final.sem, rate);
+    const mark = !rate && several(group.task) && final.mean === best(name, group.task);
+    const interval =
+      rate || !final.interval
+        ? null
+        : html("small", {}, final.interval.map((end) => plain(end, places(final.mean))).join(" to "));
+    return html("span", {}, mark ? html("b", {}, told) : told, interval);
+  };
+  const seeds = (group) => {
+    const diverged = Object.entries(group.diverged).map(
+      ([seed, step]) => `seed ${seed} diverged by step ${whole(step)}`,
+    );
+    const notes = [...diverged, ...(group.unfinished ? ["not finished"] : [])];
+    return html("span", {}, String(group.seeds.length), notes.length ? html("small", { class: "wide" }, notes.join("; ")) : null);
+  };
+  const column = (heading, name, rate) => [heading, (group) => group.final[name]?.mean, cell(name, rate), true];
+  return [
+    ["agent", (group) => group.label, (group) => html("span", {}, swatch(group.label), " ", group.label)],
+    ["task", (group) => group.task],
+    ["seeds", (group) => group.seeds.length, seeds, true],
+    ["steps", (group) => group.steps, (group) => whole(group.steps), true],
+    column("return, sampled actions", "sampled"),
+    column("return, mode actions", "mode"),
+    ...(rates
+      ? [column("success, sampled", "sampled_success", true), column("success, mode", "mode_success", true)]
+      : []),
+  ];
+}
+const list = (values) => values.join(", ");
+const told = (run) => `${run.agent} on ${run.task}`;
+const perSecond = (run) => (run.seconds && run.steps ? (run.steps * run.seeds.length) / run.seconds : null);
+const perStep = (run) => (run.seconds && run.steps ? (1000 * run.seconds) / run.steps : null);
+const device = (run) => list([...new Set(run.sessions.map((session) => session.device))]);
+const TIME = [
+  ["run", (run) => run.folder],
+  ["agent and task", told],
+  ["seeds", (run) => run.seeds.length, null, true],
+  ["steps", (run) => run.steps, (run) => whole(run.steps), true],
+  ["wall-clock", (run) => run.seconds, (run) => duration(run.seconds), true],
+  ["ms a step", perStep, (run) => plain(perStep(run)), true],
+  ["steps/s", perSecond, (run) => plain(perSecond(run)), true],
+  ["device", device],
+];
+const UNFINISHED = [
+  ["run", (run) => run.folder],
+  ["agent and task", told],
+  ["seeds", (run) => list(run.seeds)],
+  ["steps", (run) => run.steps, (run) => `${whole(run.steps)} of ${whole(run.of)}`, true],
+  ["done", (run) => run.steps / run.of, (run) => (run.of ? percent(run.steps / run.of) : "?"), true],
+];
+
+// Settings: what a run was made with is filled in when it is opened
+
+function settings(run) {
+  const changed =
+    run.settings == null
+      ? "(an agent that this version does not know)"
+      : run.settings.length
+        ? list(run.settings)
+        : "defaults";
+  const fill = ({ target }) => target.open && target.children.length === 1 && target.append(...opened(run));
+  return html(
+    "details",
+    { ontoggle: fill },
+    html("summary", {}, html("b", {}, run.folder), ` ${told(run)}: `, changed),
+  );
+}
+function opened(run) {
+  const facts = run.sessions.map((session, i) =>
+    html(
+      "dl",
+      {},
+      [
+        [i ? "resumed" : "started", `${session.started} to ${session.ended}, ${session.device}`],
+        ["command", html("code", {}, session.command)],
+        ["commit", session.commit],
+        ["versions", session.versions],
+      ].map(([name, what]) => [html("dt", {}, name), html("dd", {}, what)]),
+    ),
+  );
+  const notes = [
+    ...run.diverged,
+    ...(run.finished && run.not_counted.length
+      ? [`seeds ${list(run.not_counted)} count from another run of the same settings`]
+      : []),
+  ];
+  return [
+    notes.length ? html("p", { class: "note" }, notes.join("; ")) : null,
+    ...facts,
+    html("div", { class: "media" }, run.media.map(medium)),
+    html("details", {}, html("summary", {}, "the whole configuration"), html("pre", { tabindex: 0 }, run.config)),
+  ].filter(Boolean);
+}
+function medium({ name, address }) {
+  const film = /\.(mp4|webm)$/.test(name);
+  const view = film
+    ? html("video", { src: address, controls: true, preload: "metadata" })
+    : html("img", { src: address, alt: name, loading: "lazy" });
+  return html("figure", {}, view, html("figcaption", {}, html("a", { href: address }, name)));
+}
+
+// The page
+
+const panels = data.tasks.map((task) => new Panel(task));
+const finished = data.runs.filter((run) => run.finished).length;
+const seeds = data.groups.reduce((sum, group) => sum + group.seeds.length, 0);
+const late = data.runs.filter((run) => !run.finished);
+at("about").textContent = [
+  plural(data.runs.length, "run") + (late.length ? ` (${finished} finished)` : ""),
+  plural(seeds, "seed") + " counted",
+  plural(data.tasks.length, "task"),
+  plural(new Set(data.runs.map((run) => run.agent)).size, "agent"),
+  `made ${data.made}`,
+  `version ${data.version}`,
+].join(" · ");
+const names = data.labels.map((label) => label.name);
+chips(at("labels"), "label", names, swatch);
+chips(at("tasks"), "task", data.tasks, () => null);
+at("entries").hidden = !data.groups.some((group) => group.final.sampled_success);
+at("curves").append(...panels.map((panel) => panel.figure));
+if (!panels.length) at("curves").append(html("p", { class: "note" }, "No run is finished yet."));
+const groupRows = table(at("final"), finalColumns(), data.groups);
+const runRows = table(at("time"), TIME, data.runs);
+const details = data.runs.map((run) => ({ entry: run, element: settings(run) }));
+at("settings").append(...details.map((row) => row.element));
+at("unfinished-section").hidden = !late.length;
+table(at("unfinished"), UNFINISHED, late);
+at("unfinished-note").textContent = late.some((run) => run.group != null)
+  ? "They count in the curves and the table above, as far as they are."
+  : "Left out of the curves and the table above.";
+
+function update() {
+  const view = shown();
+  panels.forEach((panel) => panel.update(view));
+  groupRows.forEach(({ entry, element }) => (element.hidden = !view.group(entry)));
+  const visible = (run) => run.group == null || view.group(data.groups[run.group]);
+  [...runRows, ...details].forEach(({ entry, element }) => (element.hidden = !visible(entry)));
+}
+form.addEventListener("change", update);
+update();
