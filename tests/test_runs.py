@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from beliefrl import runs
+from beliefrl.provenance import provenance
 from beliefrl.runs import Recorder, Run
 from beliefrl.types import UserError
 
@@ -192,7 +193,7 @@ def test_free_folder_takes_the_first_free_number(tmp_path):
 
 
 def test_provenance_says_what_a_run_was_made_with():
-    made = runs.provenance()
+    made = provenance()
     assert set(made) == {"versions", "device", "git_commit", "command", "started"}
     assert set(made["versions"]) == {"python", "beliefrl", "jax", "jaxlib", "equinox", "optax", "numpy"}
     assert made["versions"]["jax"] == jax.__version__

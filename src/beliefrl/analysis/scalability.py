@@ -27,11 +27,14 @@ class Cost(NamedTuple):
 
 def wall_clock(run: Run) -> float | None:
     """Seconds that a run's sessions took together; None where one was killed, so that nobody knows its end."""
-    sessions = [run.config, *run.config.get("resumed", ())]
-    if not all("started" in session and "ended" in session for session in sessions):
-        return None
-    spans = [datetime.fromisoformat(each["ended"]) - datetime.fromisoformat(each["started"]) for each in sessions]
-    return sum(span.total_seconds() for span in spans)
+    total = 0.0
+    for session in (run.config, *run.config.get("resumed", ())):
+        try:
+            began, ended = (datetime.fromisoformat(session[name]) for name in ("started", "ended"))
+            total += (ended - began).total_seconds()
+        except (KeyError, TypeError, ValueError):
+            return None
+    return total
 
 
 def parameters(run: Run) -> int | None:

@@ -6,7 +6,6 @@ import os
 import pathlib
 import shlex
 from collections.abc import Iterator, Sequence
-from datetime import datetime
 from typing import Any
 from urllib.parse import quote
 
@@ -16,6 +15,7 @@ from beliefrl import agents
 from beliefrl.analysis.curves import standard_error
 from beliefrl.analysis.groups import Curve, Group, groups, is_finished, last_step
 from beliefrl.analysis.palette import colours
+from beliefrl.analysis.scalability import wall_clock
 from beliefrl.evaluation import MODES
 from beliefrl.runs import Row, Run
 from beliefrl.types import UserError
@@ -128,8 +128,6 @@ def number(value: float) -> float | None:
 def _run(run: Run, beside: pathlib.Path, groups_of: dict[int, int | None]) -> dict[str, Any]:
     config = run.config
     sessions = [each for each in (config, *_list(config.get("resumed"))) if isinstance(each, dict)]
-    lasted = [_seconds(session) for session in sessions]
-    seconds = None if None in lasted else sum(filter(None, lasted))
     steps = {seed: last_step(run, seed) for seed in run.seeds}
     return {
         "folder": str(run.folder),
@@ -142,7 +140,7 @@ def _run(run: Run, beside: pathlib.Path, groups_of: dict[int, int | None]) -> di
         "steps": max(steps.values(), default=0),
         "of": config["options"].get("steps"),
         "diverged": [f"seed {seed}: {row.get('why')}" for seed in run.seeds for row in run.rows(seed, "diverged")],
-        "seconds": seconds,
+        "seconds": wall_clock(run),
         "settings": settings(config),
         "sessions": [_session(session) for session in sessions],
         "config": json.dumps(config, indent=2),
@@ -172,15 +170,6 @@ def _session(session: dict[str, Any]) -> dict[str, str]:
         "command": shlex.join(map(str, _list(session.get("command")))),
         "versions": ", ".join(f"{name} {of}" for name, of in versions.items()) if isinstance(versions, dict) else "?",
     }
-
-
-def _seconds(session: dict[str, Any]) -> float | None:
-    """How long a process had the run; None if it was killed before it could write that down."""
-    try:
-        began, ended = (datetime.fromisoformat(session[name]) for name in ("started", "ended"))
-        return (ended - began).total_seconds()
-    except (KeyError, TypeError, ValueError):
-        return None
 
 
 def _list(value: Any) -> list[Any]:
