@@ -55,6 +55,13 @@ def test_a_seed_run_twice_counts_once_as_far_as_it_went(tmp_path):
         assert group.seeds == ((long, 0),)
 
 
+def test_of_runs_that_went_as_far_the_latest_counts(tmp_path):
+    old = a_run(tmp_path / "a", [flat(1.0)], started="2026-01-01T00:00:00+00:00")
+    new = a_run(tmp_path / "b", [flat(2.0)], started="2026-02-01T00:00:00+00:00")
+    for runs in ([old, new], [new, old]):
+        assert groups(runs)[0].seeds == ((new, 0),)
+
+
 def test_a_curve_goes_as_far_as_all_seeds_have_come(tmp_path):
     (group,) = groups([a_run(tmp_path / "a", [flat(1.0, 2.0, 3.0), flat(4.0, 5.0)])])
     np.testing.assert_array_equal(group.curve().steps, [10, 20])

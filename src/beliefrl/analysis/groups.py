@@ -93,8 +93,8 @@ def _diverged(run: Run, seed: int) -> bool:
 def groups(runs: Sequence[Run]) -> list[Group]:
     """The runs' seeds put together, in the order in which tasks and agents first come.
 
-    Of a seed that was run twice with the same settings the run that went furthest counts: a seed's number decides
-    everything, so it would count as two what is one.
+    Of a seed that was run twice with the same settings only the run that went furthest counts, and of those the latest: a
+    seed's number decides everything, so it would count as two what is one.
     """
     seeds: dict[tuple[str, str], dict[int, Run]] = {}
     for run in runs:
@@ -104,11 +104,15 @@ def groups(runs: Sequence[Run]) -> list[Group]:
         label = " ".join([run.config["agent"], *_differences(run.config["hyperparameters"], same_agent)])
         of = seeds.setdefault((task, label), {})
         for seed in run.seeds:
-            if seed not in of or last_step(run, seed) > last_step(of[seed], seed):
+            if seed not in of or _precedence(run, seed) > _precedence(of[seed], seed):
                 of[seed] = run
     tasks, labels = ([*dict.fromkeys(names)] for names in zip(*seeds, strict=True)) if seeds else ([], [])
     made = [Group(*names, [(of[seed], seed) for seed in sorted(of)]) for names, of in seeds.items()]
     return sorted(made, key=lambda group: (tasks.index(group.task), labels.index(group.label)))
+
+
+def _precedence(run: Run, seed: int) -> tuple[int, str]:
+    return last_step(run, seed), str(run.config.get("started", ""))
 
 
 def task_of(run: Run) -> str:
