@@ -93,8 +93,8 @@ def _diverged(run: Run, seed: int) -> bool:
 def groups(runs: Sequence[Run]) -> list[Group]:
     """The runs' seeds put together, in the order in which tasks and agents first come.
 
-    Of a seed that was run twice with the same settings only the run that went furthest counts, and of those the latest: a
-    seed's number decides everything, so it would count as two what is one.
+    Of a seed that was run twice with the same settings only the run that went furthest counts, and of those the latest:
+    a seed's number decides everything, so it would count as two what is one.
     """
     seeds: dict[tuple[str, str], dict[int, Run]] = {}
     for run in runs:
