@@ -13,6 +13,7 @@ FEW = {
     "01_your_own_environment.py": (["--steps", "300"], "m from the mark"),
     "02_a_task_in_jax.py": (["--steps", "300"], "return of each seed"),
     "03_a_new_agent.py": (["--steps", "300"], "seed 1: return at each evaluation {300:"),
+    "06_many_trainings.py": (["--steps", "300", "--seeds", "1"], "4 trainings are finished"),
     "05_train_elsewhere.py": (["--steps", "1024", "--episodes", "1"], "Return after 1024 steps"),
 }
 

@@ -4,7 +4,7 @@ import pytest
 
 from beliefrl import cli
 from beliefrl.sweeps import run
-from beliefrl.sweeps.run import Status
+from beliefrl.sweeps.run import SweepStatus
 from written import a_run, flat
 
 
@@ -15,7 +15,7 @@ def asked(monkeypatch, tmp_path):
 
     def sweep(experiments, folder, report, **options):
         given.append((experiments, folder, options))
-        report(Status([], []))
+        report(SweepStatus([], []))
 
     monkeypatch.setattr(run, "sweep", sweep)
     monkeypatch.chdir(tmp_path)

@@ -21,7 +21,7 @@ from beliefrl.runs import Run
 from beliefrl.schedule import Event, Options
 from beliefrl.stop import Stopped
 from beliefrl.sweeps.plan import Experiment, grid
-from beliefrl.sweeps.run import sweep
+from beliefrl.sweeps.run import SweepStatus, sweep
 from beliefrl.tasks import Task, observe
 from beliefrl.tasks import make as make_task
 from beliefrl.tasks.gymnasium import GymnasiumTask
@@ -43,6 +43,7 @@ __all__ = [
     "Spec",
     "Step",
     "Stopped",
+    "SweepStatus",
     "Task",
     "TaskEnvironment",
     "UserError",

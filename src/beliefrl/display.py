@@ -15,7 +15,7 @@ from beliefrl.checkpoint import listed
 from beliefrl.runs import Run
 from beliefrl.schedule import Event
 from beliefrl.sweeps.progress import Forecast
-from beliefrl.sweeps.run import Status
+from beliefrl.sweeps.run import SweepStatus
 
 
 def duration(seconds: float) -> str:
@@ -117,7 +117,7 @@ class SweepDisplay:
         self.forecast = Forecast(folder)
         self.live = Live(console=console, transient=True, refresh_per_second=2, auto_refresh=False)
         self.began = time.monotonic()
-        self.before: Status | None = None
+        self.before: SweepStatus | None = None
 
     def __enter__(self) -> "SweepDisplay":
         if self.console.is_terminal:
@@ -130,18 +130,18 @@ class SweepDisplay:
             done = f"{len(self.before.finished)} of {self.before.count} trainings finished in {self.folder}"
             self._line(f"{done}; `beliefrl report {self.folder} -o report.html` shows them")
 
-    def __call__(self, status: Status) -> None:
+    def __call__(self, status: SweepStatus) -> None:
         """Show how far a sweep is."""
         self.forecast.watch(status)
         self._tell_changes(status)
         if self.live.is_started:
             self.live.update(self._table(status), refresh=True)
 
-    def _tell_changes(self, status: Status) -> None:
+    def _tell_changes(self, status: SweepStatus) -> None:
         if self.before is None:
             already = f", {len(status.finished)} of them finished already" if status.finished else ""
             self._line(f"{status.count} trainings{already}, {len(status.running)} at a time")
-            self.before = Status([*status.finished], [])
+            self.before = SweepStatus([*status.finished], [])
         for name in status.running:
             if name not in self.before.running:
                 self._line(f"begins: {name}")
@@ -150,15 +150,15 @@ class SweepDisplay:
         for name, why in status.failed.items():
             if name not in self.before.failed:
                 self._line(f"failed: {name}: {why}")
-        self.before = Status([*status.finished], [*status.waiting], dict(status.running), dict(status.failed))
+        self.before = SweepStatus([*status.finished], [*status.waiting], dict(status.running), dict(status.failed))
 
-    def _summary(self, status: Status) -> str:
+    def _summary(self, status: SweepStatus) -> str:
         failed = f", {len(status.failed)} failed" if status.failed else ""
         left = self.forecast.seconds_left(status)
         ends = "" if left is None else f", about {duration(left)} left"
         return f"{len(status.finished)} of {status.count} done{failed}, {len(status.waiting)} waiting{ends}"
 
-    def _table(self, status: Status) -> Group:
+    def _table(self, status: SweepStatus) -> Group:
         table = Table(box=None, pad_edge=False)
         for heading in ("training", "step", "doing", "last return"):
             table.add_column(heading, justify="right" if heading in ("step", "last return") else "left")

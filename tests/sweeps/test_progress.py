@@ -5,7 +5,7 @@ import json
 from beliefrl.sweeps import progress as module
 from beliefrl.sweeps.plan import Experiment, plan
 from beliefrl.sweeps.progress import Forecast
-from beliefrl.sweeps.run import Status
+from beliefrl.sweeps.run import SweepStatus
 from written import a_run
 
 
@@ -13,7 +13,7 @@ def test_the_forecast_is_what_is_left_at_the_pace_seen(tmp_path, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
     first, second, third = plan([Experiment("vrm", "pendulum", {"steps": 100}, seeds=(0, 1, 2))])
-    status = Status([], [third], {first.name: first, second.name: second})
+    status = SweepStatus([], [third], {first.name: first, second.name: second})
     forecast = Forecast(tmp_path)
     forecast.watch(status)
     assert forecast.seconds_left(status) is None
@@ -23,7 +23,7 @@ def test_the_forecast_is_what_is_left_at_the_pace_seen(tmp_path, monkeypatch):
     forecast.watch(status)
     assert [each.step for each in forecast.going.values()] == [40, 40]
     assert forecast.seconds_left(status) == (2 * 60 + 2 * 60 + 2 * 100) / 2
-    status = Status([first, second], [], {third.name: third})
+    status = SweepStatus([first, second], [], {third.name: third})
     forecast.watch(status)
     assert list(forecast.going) == [third.name]
     assert forecast.seconds_left(status) == 200
@@ -31,7 +31,7 @@ def test_the_forecast_is_what_is_left_at_the_pace_seen(tmp_path, monkeypatch):
 
 def test_what_a_training_does_is_read_off_its_last_lines(tmp_path):
     (training,) = plan([Experiment("vrm", "pendulum", {"steps": 100}, seeds=(0,))])
-    forecast, status = Forecast(tmp_path), Status([], [], {training.name: training})
+    forecast, status = Forecast(tmp_path), SweepStatus([], [], {training.name: training})
     forecast.watch(status)
     (progress,) = forecast.going.values()
     assert (progress.step, progress.doing) == (0, "starting")

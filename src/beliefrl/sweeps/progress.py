@@ -6,7 +6,7 @@ import time
 
 from beliefrl.runs import Run
 from beliefrl.sweeps.plan import Training
-from beliefrl.sweeps.run import Status
+from beliefrl.sweeps.run import SweepStatus
 from beliefrl.types import UserError
 
 
@@ -51,7 +51,7 @@ class Forecast:
         self.going: dict[str, Progress] = {}
         self._seen: dict[str, float] = {}  # seconds per step of each agent
 
-    def watch(self, status: Status) -> None:
+    def watch(self, status: SweepStatus) -> None:
         """Look at every training that is going on."""
         for name in self.going.keys() - status.running.keys():
             del self.going[name]
@@ -61,7 +61,7 @@ class Forecast:
             if progress.seconds_per_step is not None:
                 self._seen[training.agent] = progress.seconds_per_step
 
-    def seconds_left(self, status: Status) -> float | None:
+    def seconds_left(self, status: SweepStatus) -> float | None:
         """Until all of the sweep is done, at the pace seen so far; None before there was any."""
         if not self._seen:
             return None

@@ -30,7 +30,7 @@ class Launcher(Protocol):
 
 
 @dataclasses.dataclass
-class Status:
+class SweepStatus:
     """How far a sweep is."""
 
     finished: list[Training]
@@ -43,7 +43,7 @@ class Status:
         return len(self.finished) + len(self.waiting) + len(self.running) + len(self.failed)
 
 
-Report = Callable[[Status], None]
+Report = Callable[[SweepStatus], None]
 
 
 def sweep(
@@ -53,7 +53,7 @@ def sweep(
     seeds_per_run: int | None = None,
     ray: str | None = None,
     report: Report | None = None,
-) -> Status:
+) -> SweepStatus:
     """Train what experiments consist of, as many at a time as there is room for; those that fail are noted.
 
     Args:
@@ -92,15 +92,15 @@ def sweep(
     return status
 
 
-def _status(folder: pathlib.Path, trainings: Sequence[Training]) -> Status:
+def _status(folder: pathlib.Path, trainings: Sequence[Training]) -> SweepStatus:
     """Where a sweep stands whose folder has these added to it."""
     planned = {training.name: training for training in (*plans.read(folder), *trainings)}
     plans.write(folder, list(planned.values()))
     finished = [training for training in planned.values() if training.is_finished(folder)]
-    return Status(finished, [training for training in planned.values() if training not in finished])
+    return SweepStatus(finished, [training for training in planned.values() if training not in finished])
 
 
-def _loop(folder: pathlib.Path, status: Status, launcher: Launcher, report: Report, requests: Requests) -> None:
+def _loop(folder: pathlib.Path, status: SweepStatus, launcher: Launcher, report: Report, requests: Requests) -> None:
     while status.waiting or status.running:
         while status.waiting and launcher.room:
             training = status.waiting.pop(0)
