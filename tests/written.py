@@ -1,0 +1,27 @@
+"""Folders of runs that are written by hand."""
+
+import json
+
+EVIL = "</script><img src=x onerror=alert(1)>"
+HOUR = {"started": "2026-01-01T10:00:00+00:00", "ended": "2026-01-01T11:00:00+00:00", "device": "cpu"}
+
+
+def a_run(folder, seeds, agent="vrm", task="pendulum-v", steps=20, first=0, diverged=(), **config):
+    """A folder with these evaluations of each seed: (step, returns with sampled actions[, successes])."""
+    (folder / "metrics").mkdir(parents=True)
+    options = {"seed": first, "seeds": len(seeds), "steps": steps}
+    whole = {"agent": agent, "hyperparameters": {}, "task": task, "constants": {}, "options": options} | config
+    (folder / "config.json").write_text(json.dumps(whole))
+    for seed, rows in enumerate(seeds, first):
+        lines = [{"step": 1, "kind": "update", "loss": 0.0}]
+        for step, returns, *success in rows:
+            rates = {"sampled_success": success[0], "mode_success": [True]} if success else {}
+            lines.append({"step": step, "kind": "evaluation", "sampled": returns, "mode": [7.0], **rates})
+        if seed in diverged:
+            lines.append({"step": lines[-1]["step"] + 5, "kind": "diverged", "why": "a loss is not finite"})
+        text = "".join(json.dumps(line) + "\n" for line in lines)
+        (folder / "metrics" / f"seed-{seed}.jsonl").write_text(text)
+    return folder
+
+
+TWO_SEEDS = [[(10, [1.0, 2.0]), (20, [3.0, 5.0])], [(10, [-1.0, 4.0]), (20, [7.0, 7.0])]]
