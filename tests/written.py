@@ -4,30 +4,40 @@ import json
 
 from beliefrl.runs import Run
 
+EVIL = "</script><img src=x onerror=alert(1)>"
+HOUR = {"started": "2026-01-01T10:00:00+00:00", "ended": "2026-01-01T11:00:00+00:00", "device": "cpu"}
+TWO_SEEDS = [[(10, [1.0, 2.0]), (20, [3.0, 5.0])], [(10, [-1.0, 4.0]), (20, [7.0, 7.0])]]
+ONE_UPDATE = [(1, {"loss": 0.0})]
 
-def a_run(folder, seeds, agent="vrm", task="pendulum-v", steps=None, first=0, settings=None, updates=None, **config):
-    """A run whose seeds have these evaluations: for each a list of (step, returns with sampled actions).
+
+def a_folder(
+    folder, seeds, agent="vrm", task="pendulum-v", steps=20, first=0, diverged=(), updates=ONE_UPDATE, **config
+):
+    """A folder with these evaluations of each seed: (step, returns with sampled actions[, successes]).
 
     `updates` are rows of every seed's learning: (step, {name: value}).
     """
     (folder / "metrics").mkdir(parents=True)
-    last = max((rows[-1][0] for rows in seeds if rows), default=0)
-    options = {"seed": first, "seeds": len(seeds), "steps": last if steps is None else steps}
-    written = {
-        "agent": agent,
-        "hyperparameters": settings or {},
-        "task": task,
-        "constants": {},
-        "options": options,
-        **config,
-    }
-    (folder / "config.json").write_text(json.dumps(written))
+    options = {"seed": first, "seeds": len(seeds), "steps": steps}
+    whole = {"agent": agent, "hyperparameters": {}, "task": task, "constants": {}, "options": options} | config
+    (folder / "config.json").write_text(json.dumps(whole))
     for seed, rows in enumerate(seeds, first):
-        lines = [{"step": step, "kind": "update", **values} for step, values in updates or ()]
-        lines += [{"step": step, "kind": "evaluation", "sampled": returns, "mode": [0.0]} for step, returns in rows]
+        lines = [{"step": step, "kind": "update", **values} for step, values in updates]
+        for step, returns, *success in rows:
+            rates = {"sampled_success": success[0], "mode_success": [True]} if success else {}
+            lines.append({"step": step, "kind": "evaluation", "sampled": returns, "mode": [7.0], **rates})
+        if seed in diverged:
+            lines.append({"step": lines[-1]["step"] + 5, "kind": "diverged", "why": "a loss is not finite"})
         text = "".join(json.dumps(line) + "\n" for line in lines)
         (folder / "metrics" / f"seed-{seed}.jsonl").write_text(text)
-    return Run(folder)
+    return folder
+
+
+def a_run(folder, seeds, steps=None, settings=None, updates=(), **rest):
+    """The run in such a folder; it is finished, unless it has `steps` that none of its seeds has reached."""
+    last = max((rows[-1][0] for rows in seeds if rows), default=0)
+    steps = last if steps is None else steps
+    return Run(a_folder(folder, seeds, steps=steps, hyperparameters=settings or {}, updates=updates, **rest))
 
 
 def flat(*returns):
