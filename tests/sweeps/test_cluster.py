@@ -19,7 +19,15 @@ from beliefrl.types import UserError
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'beliefrl[sweep]'.")
 pytestmark = pytest.mark.slow
 
-QUICK = {"steps": 300, "eval_every": 100, "eval_episodes": 1, "step_start_rl": 100, "pretrain_updates": 5}
+QUICK = {
+    "steps": 300,
+    "eval_every": 100,
+    "eval_episodes": 1,
+    "step_start_rl": 100,
+    "pretrain_updates": 5,
+    "policy_layers": [8],
+    "value_layers": [8],
+}
 RAY = pathlib.Path(sys.executable).parent / "ray"
 
 
