@@ -35,6 +35,7 @@ class Cluster:
             raise UserError("--ray needs Ray: pip install 'beliefrl[sweep]'.") from None
         self._ray, self.sweep, self._workers = ray, sweep.absolute(), workers
         try:
+            _knock(address)
             ray.init(address=address, log_to_driver=False, configure_logging=False)
         except (ConnectionError, RuntimeError, ValueError, OSError) as error:
             why = str(error).splitlines()[0].rstrip(".")
@@ -80,6 +81,13 @@ class Cluster:
                 self._ray.get(reference)
         self._running = {}
         self._ray.shutdown()
+
+
+def _knock(address: str) -> None:
+    """Raise an OSError where nobody answers: Ray itself would try for minutes."""
+    host, _, port = address.rpartition(":")
+    if host and port.isdigit():
+        socket.create_connection((host, int(port)), timeout=10).close()
 
 
 def train_there(sweep: str, log: str, command: list[str], on_gpu: bool) -> int:
