@@ -101,8 +101,9 @@ class Player:
 
 def _moment(obs: Any, reward: float, action: Any, is_first: bool = False, terminated: bool = False) -> Step:
     """A moment in numpy."""
-    numbers = np.asarray(obs, np.float32), np.float32(reward), np.asarray(action, np.float32)
-    return Step(*numbers, np.bool_(is_first), np.bool_(terminated))
+    numbers: Any = np.asarray(obs, np.float32), np.float32(reward), np.asarray(action, np.float32)
+    flags: Any = np.bool_(is_first), np.bool_(terminated)
+    return Step(*numbers, *flags)
 
 
 def play(
@@ -133,7 +134,7 @@ def play(
         return player.play(episode_seed, sampled, steps, at)
 
 
-def check_episode(episode_seed: int, steps: int | None) -> None:
+def check_episode(episode_seed: int, steps: int | None = None) -> None:
     """Raise a UserError where one of them is impossible."""
     if not 0 <= episode_seed <= LARGEST:
         raise UserError(f"episode_seed={episode_seed} is impossible: it must be from 0 to {LARGEST}.")

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
-from beliefrl.commands import bench, lists, runs, training
+from beliefrl.commands import bench, lists, pictures, runs, training
 
 COMMANDS: dict[str, Callable[[Sequence[str]], None]] = {
     "train": training.train,
@@ -10,6 +10,9 @@ COMMANDS: dict[str, Callable[[Sequence[str]], None]] = {
     "show": runs.show,
     "evaluate": runs.evaluate,
     "export": runs.export,
+    "predict": pictures.predict,
+    "video": pictures.video,
+    "film": pictures.film,
     "tasks": lists.list_tasks,
     "agents": lists.list_agents,
     "bench": bench.bench,
