@@ -1,4 +1,4 @@
-"""An episode of a trained agent: every moment where it belongs, the agent's own actions, frames of the right moments."""
+"""An episode of a trained agent: every moment where it belongs, the agent's own actions, the frames asked for."""
 
 import jax
 import numpy as np

@@ -1,6 +1,7 @@
 """Films and film strips: every frame, at its time, in a file that is there whole or not at all."""
 
 import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -98,7 +99,7 @@ def test_a_line_below_the_picture_leaves_it_as_it_is_and_its_sides_even():
 
 
 def test_an_mp4_without_its_encoder_is_told_in_a_sentence(tmp_path, run, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "imageio_ffmpeg", None)
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(UserError, match=r"pip install 'beliefrl\[video\]', or make a \.gif"):
         films.video(run, tmp_path / "film.mp4")
 
@@ -122,9 +123,12 @@ def test_a_strip_has_a_row_for_each_run(tmp_path, run):
 def test_the_commands_write_their_files(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     saved(tmp_path / "run", "vrm", TASK)
-    main("video run film.gif --steps 2 --episodes 2 --episode-seed 7".split())
-    main("film run --frames 2 --out strip.png".split())
-    main("predict run --start 2 --samples 2 --horizon 2".split())
+    for line in (
+        "video run film.gif --steps 2 --episodes 2 --episode-seed 7",
+        "film run --frames 2 --out strip.png",
+        "predict run --start 2 --samples 2 --horizon 2",
+    ):
+        main(line.split())
     out, err = capsys.readouterr()
     assert err == ""
     assert "episode 8: 2 steps, return -" in out
