@@ -11,14 +11,13 @@ from beliefrl.episodes import Player
 from beliefrl.policy import Policy
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.types import UserError
-from worlds import Counter, Counting, CountingAgent, saved, tiny
+from worlds import Counter, Counting, CountingAgent, begun, saved, tiny
 
 TASK = tasks.make("pendulum-p", max_steps=6)
 
 
-def player(task=TASK, name="vrm", rendered=False):
-    agent = tiny(name)
-    return Player(agent, task, agent.init(jax.random.key(0), task.spec), rendered)
+def player(task=TASK, name="sac-lstm", rendered=False):
+    return Player(tiny(name), task, begun(name, task.spec, jax.random.key(0)), rendered)
 
 
 @pytest.mark.parametrize(("ends", "last"), [(1000, 7), (4, 4)])
@@ -35,7 +34,7 @@ def test_every_moment_is_where_it_belongs(ends, last):
     assert frames == {}
 
 
-@pytest.mark.parametrize("name", ["vrm", "sac-mlp"])
+@pytest.mark.parametrize("name", ["sac-lstm", "sac-mlp"])
 def test_mode_actions_are_those_of_the_policy(name):
     playing = player(name=name)
     steps = playing.play(3).steps
@@ -110,7 +109,7 @@ def test_what_cannot_be_seen_is_told_in_a_sentence(task, sentence):
 
 
 def test_a_runs_seed_is_played_by_its_number(tmp_path):
-    run = saved(tmp_path / "run", "vrm", TASK, seeds=2)
+    run = saved(tmp_path / "run", "sac-mlp", TASK, seeds=2)
     first, same, second = (beliefrl.play(run, seed) for seed in (None, 4, 5))
     np.testing.assert_array_equal(first.steps.prev_action, same.steps.prev_action)
     assert not np.allclose(first.steps.prev_action, second.steps.prev_action)

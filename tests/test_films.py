@@ -42,7 +42,7 @@ def frames_of(path):
 
 def test_a_film_shows_every_step_of_every_episode(tmp_path, counted):
     run, task = counted
-    played = films.video(run, tmp_path / "film.gif", fps=20, episodes=2, steps=4, task=task)
+    played = films.video(run, tmp_path / "film.gif", fps=20.0, episodes=2, steps=4, task=task)
     assert shown(tmp_path / "film.gif") == [(time, 50) for time in (0, 1, 2, 3, 4, 0, 1, 2, 3, 4)]
     assert [episode.total for episode in played] == [10.0, 10.0]
 
@@ -110,7 +110,7 @@ def test_a_strip_is_evenly_spaced_from_the_first_moment_to_the_last(run):
 
 
 def test_a_strip_has_a_row_for_each_run(tmp_path, run):
-    other = saved(tmp_path / "other", "vrm", TASK)
+    other = saved(tmp_path / "other", "sac-mlp", TASK)
     heights = []
     for runs in ([run], [run, other]):
         with Image.open(films.film(runs, frames=2)) as image:
@@ -122,7 +122,7 @@ def test_a_strip_has_a_row_for_each_run(tmp_path, run):
 
 def test_the_commands_write_their_files(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    saved(tmp_path / "run", "vrm", TASK)
+    saved(tmp_path / "run", "slac", TASK)
     for line in (
         "video run film.gif --steps 2 --episodes 2 --episode-seed 7",
         "film run --frames 2 --out strip.png",

@@ -1,6 +1,7 @@
 """Tasks and an agent with nothing in them but what a test needs to see."""
 
 import dataclasses
+from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import gymnasium
@@ -27,10 +28,16 @@ def tiny(name, **hyperparameters):
     return agents.make(name, policy_layers=(8,), value_layers=(8,), **sizes, **hyperparameters)
 
 
+@partial(jax.jit, static_argnums=(0, 1))
+def begun(name, spec, key):
+    """The state in which a small agent begins."""
+    return tiny(name).init(key, spec)
+
+
 def saved(folder, name, task, seeds=1):
     """A run of a small agent that has not learned anything yet, but was saved."""
     agent = tiny(name)
-    states = jax.vmap(lambda key: agent.init(key, task.spec))(jax.random.split(jax.random.key(0), seeds))
+    states = jax.vmap(partial(begun, name, task.spec))(jax.random.split(jax.random.key(0), seeds))
     config = {
         "agent": name,
         "hyperparameters": dataclasses.asdict(agent),

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from beliefrl import figures, rendering
@@ -102,7 +103,7 @@ def _captioned(add: Writer, index: int, episodes: int) -> Callable[[Frame], None
     return watch
 
 
-def caption(pixels: Pixels, text: str) -> Pixels:
+def caption(pixels: Pixels, text: str) -> UInt8[np.ndarray, "taller wider 3"]:
     """The picture with a line of text below it; both sides are even, as video encoders want them."""
     height, width, _ = pixels.shape
     size = max(12, width // 30)

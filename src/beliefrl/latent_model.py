@@ -146,7 +146,7 @@ def predict(
         both = jax.tree.map(lambda *parts: jnp.concatenate(parts), model.decoder(z1, z2), reward)
         return (z1, z2), both
 
-    start = jnp.zeros_like(noise[0][0]), jnp.zeros_like(noise[1][0])
+    start, x = (jnp.zeros_like(noise[0][0]), jnp.zeros_like(noise[1][0])), jnp.where(seen[:, None], x, 0.0)
     return jax.lax.scan(step, start, (x, prev_action, is_first, seen, noise))[1]
 
 

@@ -157,7 +157,7 @@ def draw_predictions(
             seen = ", ".join(map(str, predicted.entries))
             raise UserError(f"entries={entry} is impossible: the agent sees {seen} of the observation.")
     rows = {f"observation {entry}": predicted.entries.index(entry) for entry in entries} | {"reward": -1}
-    figure = figures.figure(8, 1 + 1.3 * len(rows))
+    figure = figures.figure(8.0, 1.0 + 1.3 * len(rows))
     axes = figure.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
     for axis, (label, index) in zip(axes, rows.items(), strict=True):
         _draw_row(axis, predicted, index)

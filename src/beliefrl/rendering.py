@@ -66,7 +66,8 @@ def pixels(environment: TaskEnvironment | Environment) -> Pixels:
     except UserError:
         raise
     except Exception as error:  # whatever a stranger's environment may raise
-        hint = f"; {MUJOCO}" if _is_mujoco(environment) else ""
+        bare = environment.inner.unwrapped if isinstance(environment, Environment) else environment
+        hint = f"; {MUJOCO}" if hasattr(bare, "mujoco_renderer") else ""
         raise UserError(f"{name} cannot be rendered here: {said(error)}{hint}.") from None
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] not in (3, 4):
         given = f"{image.dtype} of shape {image.shape}"
@@ -74,15 +75,7 @@ def pixels(environment: TaskEnvironment | Environment) -> Pixels:
     return np.ascontiguousarray(image[..., :3])
 
 
-def _is_mujoco(environment: Any) -> bool:
-    return (
-        "mujoco" in sys.modules
-        and hasattr(environment, "inner")
-        and hasattr(environment.inner.unwrapped, "mujoco_renderer")
-    )
-
-
 def pace(environment: TaskEnvironment | Environment) -> float:
     """Steps in a second of the task's own time."""
     inner = environment.inner if isinstance(environment, Environment) else environment
-    return float(inner.metadata.get("render_fps") or PACE)
+    return float(getattr(inner, "metadata", {}).get("render_fps") or PACE)

@@ -163,7 +163,7 @@ def predict(
         sigma = jnp.zeros_like(sigma) if vrm.deterministic else sigma
         return vrm.next_state(state, jnp.where(seen, x, mean + sigma * noise_x), z), Gaussian(mean, sigma)
 
-    start = jax.tree.map(lambda leaf: leaf[0], vrm.start(1))
+    start, x = jax.tree.map(lambda leaf: leaf[0], vrm.start(1)), jnp.where(seen[:, None], x, 0.0)
     return jax.lax.scan(step, start, (x, prev_action, seen, noise))[1]
 
 
