@@ -1,12 +1,76 @@
 """Tasks and an agent with nothing in them but what a test needs to see."""
 
 import dataclasses
+from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
+import gymnasium
 import jax
 import jax.numpy as jnp
+import numpy as np
+from gymnasium import spaces
 
+from beliefrl import agents, tasks
+from beliefrl.runs import Recorder, Run
 from beliefrl.types import Spec, WindowShape, transitions
+
+TINY = {
+    "vrm": {"d_size": 8, "z_size": 4, "hidden_size": 8},
+    "sac-mlp": {},
+    "sac-lstm": {"d_size": 8},
+    "slac": {"z1_size": 2, "z2_size": 4, "model_layers": (8,), "history": 3},
+}
+
+
+def tiny(name, **hyperparameters):
+    """An agent with small networks; an ablation's name will do."""
+    sizes = TINY["vrm" if name.startswith("vrm") else name]
+    return agents.make(name, policy_layers=(8,), value_layers=(8,), **sizes, **hyperparameters)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def begun(name, spec, key):
+    """The state in which a small agent begins."""
+    return tiny(name).init(key, spec)
+
+
+def saved(folder, name, task, seeds=1):
+    """A run of a small agent that has not learned anything yet, but was saved."""
+    agent = tiny(name)
+    states = jax.vmap(partial(begun, name, task.spec))(jax.random.split(jax.random.key(0), seeds))
+    config = {
+        "agent": name,
+        "hyperparameters": dataclasses.asdict(agent),
+        **tasks.describe(task),
+        "options": {"steps": 100, "seed": 4, "seeds": seeds},
+    }
+    recorder = Recorder(folder, config)
+    recorder.save(states)
+    recorder.close()
+    return Run(folder)
+
+
+class Counter(gymnasium.Env):
+    """Observes and shows how many steps the episode has had, on a picture of an odd width; terminates at `ends`."""
+
+    metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 125}
+    observation_space = spaces.Box(0.0, 100.0, (2,), np.float32)
+    action_space = spaces.Box(-2.0, 2.0, (1,), np.float32)
+
+    def __init__(self, render_mode=None, ends=9):
+        self.render_mode, self.ends = render_mode, ends
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        return np.full(2, self.steps, np.float32), float(self.steps), self.steps >= self.ends, False, {}
+
+    def render(self):
+        return np.full((20, 31, 3), 10 * self.steps, np.uint8) if self.render_mode == "rgb_array" else None
 
 
 @dataclasses.dataclass(frozen=True)

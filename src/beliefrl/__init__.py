@@ -14,8 +14,11 @@ from beliefrl.agents import Agent
 from beliefrl.agents import make as make_agent
 from beliefrl.analysis.curves import draw_curve
 from beliefrl.environment import TaskEnvironment, register
+from beliefrl.episodes import Trajectory, play
 from beliefrl.evaluation import evaluate, task_of
+from beliefrl.films import film, video
 from beliefrl.policy import Policy, load
+from beliefrl.prediction import Predictions, draw_predictions, predictions
 from beliefrl.report import write_report
 from beliefrl.runs import Run
 from beliefrl.schedule import Event, Options
@@ -39,6 +42,7 @@ __all__ = [
     "Moment",
     "Options",
     "Policy",
+    "Predictions",
     "Run",
     "Spec",
     "Step",
@@ -46,19 +50,25 @@ __all__ = [
     "SweepStatus",
     "Task",
     "TaskEnvironment",
+    "Trajectory",
     "UserError",
     "Window",
     "WindowShape",
     "draw_curve",
+    "draw_predictions",
     "evaluate",
+    "film",
     "grid",
     "load",
     "make_agent",
     "make_task",
     "observe",
+    "play",
+    "predictions",
     "resume",
     "sweep",
     "task_of",
     "train",
+    "video",
     "write_report",
 ]

@@ -3,8 +3,10 @@
 An array is named by its place in the tree. Random keys are kept as their numbers. Nothing that is read can run code.
 """
 
+import contextlib
 import os
 import pathlib
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -74,12 +76,21 @@ def _numbers(leaf: Any) -> Any:
 
 def write_whole(path: pathlib.Path, content: bytes) -> None:
     """Write a file so that it is either the old one or the new one whole, whatever happens meanwhile."""
-    temporary = path.with_name(f".{path.name}.tmp")
-    with temporary.open("wb") as file:
+    with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+
+
+@contextlib.contextmanager
+def replacing(path: pathlib.Path) -> Iterator[pathlib.Path]:
+    """Another name to write a file under, which then takes the place of `path`; or is gone where writing failed."""
+    temporary = path.with_name(f".{path.name}.tmp")
+    try:
+        yield temporary
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
     sync_folder(path.parent)
 
 

@@ -20,6 +20,9 @@ Reinforcement learning for agents that do not see the whole state.
   beliefrl evaluate RUN         play new episodes with what a run has learned
   beliefrl export RUN FILE      write the learned policy as one file that jax loads without this library
   beliefrl report RUNS          one page for the browser: curves, final returns, settings, time
+  beliefrl predict RUN          draw what its model predicts of an episode, open loop and closed loop, beside the truth
+  beliefrl video RUN FILE       film episodes, as mp4 or gif
+  beliefrl film RUN ...         draw a film strip of an episode, a row for each run
   beliefrl tasks                list the tasks
   beliefrl agents               list the agents
   beliefrl bench AGENT          time a training step on this machine, part by part; `all` compares the agents

@@ -57,6 +57,22 @@ def restore(run: Run, task: Task | GymnasiumTask | None = None) -> tuple[Agent, 
     return agent, found, run.load(like)
 
 
+def restore_seed(
+    run: Run | str | os.PathLike[str], seed: int | None = None, task: Task | GymnasiumTask | None = None
+) -> tuple[Agent, Any, Any]:
+    """The agent, the task and the trained state of one seed of a run, its first if `seed` is None; see `restore`.
+
+    Raises:
+        UserError: there is no such run, nothing was saved in it, or it has no such seed.
+    """
+    run = run if isinstance(run, Run) else Run(run)
+    seed = run.seeds[0] if seed is None else seed
+    if seed not in run.seeds:
+        raise UserError(f"{run.folder} has no seed {seed}: it has {', '.join(map(str, run.seeds))}.")
+    agent, found, states = restore(run, task)
+    return agent, found, jax.tree.map(lambda leaf: leaf[run.seeds.index(seed)], states)
+
+
 def agent_of(run: Run) -> Agent:
     """The agent of a run, before it was trained.
 

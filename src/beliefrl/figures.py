@@ -10,12 +10,12 @@ from beliefrl.types import UserError
 KINDS = (".png", ".pdf")
 
 
-def figure(width: float, height: float) -> Any:
+def figure(width: float, height: float, layout: Any = "constrained") -> Any:
     """A figure of matplotlib, in inches, that needs no display and leaves no global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    made = Figure(figsize=(width, height), layout="constrained")
+    made = Figure(figsize=(width, height), layout=layout)
     FigureCanvasAgg(made)
     return made
 

@@ -118,6 +118,38 @@ class LatentModel(eqx.Module):
         return _loop(weights, (given1, given2), is_first, noise)
 
 
+def predict(
+    model: LatentModel,
+    x: Float[Array, "time x"],
+    prev_action: Float[Array, "time action"],
+    seen: Bool[Array, " time"],
+    noise: tuple[Float[Array, "time z1"], Float[Array, "time z2"]],
+) -> Gaussian:
+    """p(x_t | z_{t-1}, a_{t-1}, z_t) along one episode from its first moment on, leaves (time, x).
+
+    Where x_t is `seen`, z¹_t is drawn from the posterior: open loop. Where it is not, z¹_t is drawn from the prior:
+    closed loop. The first moment comes with no reward: NaN stands there.
+    """
+    is_first = jnp.arange(len(seen)) == 0
+
+    def step(before: tuple[Array, Array], inputs: tuple) -> tuple[tuple[Array, Array], Gaussian]:
+        x, prev_action, is_first, seen, noise = inputs
+        known = jnp.concatenate([is_first[None].astype(x.dtype), prev_action])
+        q, p = model.posterior(x, known, before[1]), model.prior(before[1], prev_action)
+        p = Gaussian(jnp.where(is_first, 0.0, p.mean), jnp.where(is_first, 1.0, p.sigma))
+        of_z1 = jax.tree.map(lambda posterior, prior: jnp.where(seen, posterior, prior), q, p)
+        z1 = of_z1.mean + of_z1.sigma * noise[0]
+        of_z2 = model.next_z2(known, z1, before[1])
+        z2 = of_z2.mean + of_z2.sigma * noise[1]
+        reward = model.reward(*before, prev_action, z1, z2)
+        reward = jax.tree.map(lambda leaf: jnp.where(is_first, jnp.nan, leaf), reward)
+        both = jax.tree.map(lambda *parts: jnp.concatenate(parts), model.decoder(z1, z2), reward)
+        return (z1, z2), both
+
+    start, x = (jnp.zeros_like(noise[0][0]), jnp.zeros_like(noise[1][0])), jnp.where(seen[:, None], x, 0.0)
+    return jax.lax.scan(step, start, (x, prev_action, is_first, seen, noise))[1]
+
+
 class Loop(NamedTuple):
     """The weights that stay inside the loop; of the two networks only what is behind their first layers."""
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from beliefrl.agents import Agent
 from beliefrl.arrays import write_whole
-from beliefrl.evaluation import restore
+from beliefrl.evaluation import restore_seed
 from beliefrl.runs import Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import GymnasiumTask
@@ -155,9 +155,5 @@ def load(
         UserError: there is no such run, nothing was saved in it, or it has no such seed.
     """
     run = run if isinstance(run, Run) else Run(run)
-    seed = run.seeds[0] if seed is None else seed
-    if seed not in run.seeds:
-        raise UserError(f"{run.folder} has no seed {seed}: it has {', '.join(map(str, run.seeds))}.")
-    agent, found, states = restore(run, task)
-    index = run.seeds.index(seed)
-    return Policy(agent, found.spec, jax.tree.map(lambda leaf: leaf[index], states), seed)
+    agent, found, state = restore_seed(run, seed, task)
+    return Policy(agent, found.spec, state, run.seeds[0] if seed is None else seed)

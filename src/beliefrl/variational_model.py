@@ -132,6 +132,40 @@ class VRM(eqx.Module):
         weights = Loop(self.joint.by_d, self.joint.by_z, self.posterior_mean, self.posterior_sigma)
         return _loop(weights, start, given, is_first, noise)
 
+    def next_state(self, state: LSTMState, x: Float[Array, " x"], z: Float[Array, " z"]) -> LSTMState:
+        """d_t and its cell, from d_{t-1} and its cell."""
+        joint, gates = self.joint, slice(-self.joint.by_z.shape[1], None)
+        given = self.features(x) @ joint.by_features[:, gates] + state.d @ joint.by_d[:, gates] + joint.bias[gates]
+        return LSTMState(*lstm_state(given + z @ joint.by_z, state.c))
+
+
+def predict(
+    vrm: VRM,
+    x: Float[Array, "time x"],
+    prev_action: Float[Array, "time action"],
+    seen: Bool[Array, " time"],
+    noise: tuple[Float[Array, "time z"], Float[Array, "time x"]],
+) -> Gaussian:
+    """p(x_t | z_t, d_{t-1}) along one episode from its first moment on, leaves (time, x).
+
+    Where x_t is `seen`, z_t is drawn from the posterior: open loop. Where it is not, z_t is drawn from the prior, and
+    the LSTM is fed with a draw of x_t from the decoder: closed loop. A deterministic model has σ = 0.
+    """
+
+    def step(state: LSTMState, inputs: tuple) -> tuple[LSTMState, Gaussian]:
+        x, prev_action, seen, (noise_z, noise_x) = inputs
+        moment = jax.tree.map(lambda leaf: leaf[None, None], (x, prev_action, jnp.array(False), noise_z))
+        z = vrm.infer(jax.tree.map(lambda leaf: leaf[None], state), *moment).z[0, 0]
+        if not vrm.deterministic:  # there posterior and prior are one
+            prior = vrm.prior(state.d, prev_action)
+            z = jnp.where(seen, z, prior.mean + prior.sigma * noise_z)
+        mean, sigma = vrm.decode(state.d, z)
+        sigma = jnp.zeros_like(sigma) if vrm.deterministic else sigma
+        return vrm.next_state(state, jnp.where(seen, x, mean + sigma * noise_x), z), Gaussian(mean, sigma)
+
+    start, x = jax.tree.map(lambda leaf: leaf[0], vrm.start(1)), jnp.where(seen[:, None], x, 0.0)
+    return jax.lax.scan(step, start, (x, prev_action, seen, noise))[1]
+
 
 class Terms(NamedTuple):
     """The two terms of the ELBO at every step, each summed or averaged over its dimensions."""

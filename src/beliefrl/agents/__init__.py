@@ -10,6 +10,7 @@ from beliefrl.agents.sac_lstm import SACLSTMAgent
 from beliefrl.agents.sac_mlp import SACMLPAgent
 from beliefrl.agents.slac import SLACAgent
 from beliefrl.agents.vrm import VRMAgent
+from beliefrl.nets import Gaussian
 from beliefrl.types import Spec, Step, UserError, Window, WindowShape
 
 Metrics = dict[str, Float[Array, ""]]
@@ -75,6 +76,24 @@ class Agent(Protocol):
 
     def update(self, state: Any, batch: Any, key: Key[Array, ""]) -> tuple[Any, Metrics]:
         """One update of the controller."""
+        ...
+
+
+@runtime_checkable
+class Predictive(Protocol):
+    """An agent that has a model of what it perceives can be asked for its predictions; it need not."""
+
+    @property
+    def predictors(self) -> tuple[str, ...]:
+        """The names of its models, the one to be asked by default first."""
+        ...
+
+    def predict(self, state: Any, model: str, step: Step, seen: Bool[Array, " time"], key: Key[Array, ""]) -> Gaussian:
+        """What one of its models predicts of x_t = (o_t, r_{t-1}) along an episode, leaves (time, x).
+
+        Open loop where x_t is `seen`: latent variables are inferred from it. Closed loop where it is not: they are
+        drawn from the generative model, and x_t must not be looked at. NaN is what a model does not predict.
+        """
         ...
 
 

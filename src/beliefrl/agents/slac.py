@@ -19,8 +19,8 @@ import optax
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents.sac import SAC, Metrics, split_updates
-from beliefrl.latent_model import LatentModel, Latents, elbo_terms
-from beliefrl.nets import descend, draw
+from beliefrl.latent_model import LatentModel, Latents, elbo_terms, predict
+from beliefrl.nets import Gaussian, descend, draw
 from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean
 from beliefrl.types import (
     Spec,
@@ -130,6 +130,20 @@ class SLACAgent(SAC):
 
     def note(self, memory: Float[Array, "history x"]) -> tuple[()]:
         return ()
+
+    # Predicting
+
+    @property
+    def predictors(self) -> tuple[str, ...]:
+        return ("latent",)
+
+    def predict(
+        self, state: State, model: str, step: Step, seen: Bool[Array, " time"], key: Key[Array, ""]
+    ) -> Gaussian:
+        key1, key2 = jax.random.split(key)
+        time = len(seen)
+        noise = jax.random.normal(key1, (time, self.z1_size)), jax.random.normal(key2, (time, self.z2_size))
+        return predict(state.model, perception(step), step.prev_action, seen, noise)
 
     # Learning the model
 

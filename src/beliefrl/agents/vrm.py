@@ -22,7 +22,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents.sac import SAC, Metrics, split_updates
-from beliefrl.nets import LSTMState, descend, draw
+from beliefrl.nets import Gaussian, LSTMState, descend, draw
 from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean
 from beliefrl.types import (
     Spec,
@@ -36,7 +36,7 @@ from beliefrl.types import (
     time_major,
     transitions,
 )
-from beliefrl.variational_model import VRM, elbo_terms, prediction_error
+from beliefrl.variational_model import VRM, elbo_terms, predict, prediction_error
 
 
 class Memory(NamedTuple):
@@ -199,6 +199,19 @@ class VRMAgent(SAC):
         """d_t of the first-impression model, or nothing."""
         return (memory.first.d,) if self.store_first_impression and memory.first is not None else ()
 
+    # Predicting (Appendix "Model Accuracy")
+
+    @property
+    def predictors(self) -> tuple[str, ...]:
+        return ("keep",) * self.has_keep + ("first",) * self.has_first
+
+    def predict(
+        self, state: State, model: str, step: Step, seen: Bool[Array, " time"], key: Key[Array, ""]
+    ) -> Gaussian:
+        x, keys = perception(step), jax.random.split(key)
+        noise = jax.random.normal(keys[0], (len(x), self.z_size)), jax.random.normal(keys[1], x.shape)
+        return predict(getattr(state, model), x, step.prev_action, seen, noise)
+
     # Learning the models (Figure 2c)
 
     def pretrain(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Metrics]:
@@ -219,8 +232,7 @@ class VRMAgent(SAC):
     ) -> tuple[VRM, optax.OptState, Metrics]:
         """One step up the ELBO of the windows' last `seq_len` moments but one."""
         grads, metrics = jax.grad(self.model_loss, has_aux=True)(vrm, windows, key)
-        vrm, optimiser = descend(self.model_optimiser, grads, optimiser, vrm)
-        return vrm, optimiser, metrics
+        return *descend(self.model_optimiser, grads, optimiser, vrm), metrics
 
     def model_loss(self, vrm: VRM, windows: Window, key: Key[Array, ""]) -> tuple[Float[Array, ""], Metrics]:
         """The negative ELBO (the squared error of deterministic models), mean over the valid moments after burn-in."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
-from beliefrl.commands import bench, figure, lists, report, runs, sweep, training
+from beliefrl.commands import bench, figure, lists, pictures, report, runs, sweep, training
 
 COMMANDS: dict[str, Callable[[Sequence[str]], None]] = {
     "train": training.train,
@@ -13,6 +13,9 @@ COMMANDS: dict[str, Callable[[Sequence[str]], None]] = {
     "evaluate": runs.evaluate,
     "export": runs.export,
     "report": report.report,
+    "predict": pictures.predict,
+    "video": pictures.video,
+    "film": pictures.film,
     "tasks": lists.list_tasks,
     "agents": lists.list_agents,
     "bench": bench.bench,

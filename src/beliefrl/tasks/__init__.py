@@ -89,6 +89,15 @@ def observe(task: Any, indices: tuple[int, ...]) -> Any:
     return Observed(task, tuple(indices))
 
 
+def entries(task: Any) -> tuple[int, ...]:
+    """Which entries of the task's full observation the agent sees, in its order; the numbers that `observe` takes."""
+    if isinstance(task, Observed):
+        inner = entries(task.task)
+        return tuple(inner[i] for i in task.indices)
+    indices = getattr(task, "indices", None)
+    return tuple(range(task.spec.obs_dim)) if indices is None else tuple(indices)
+
+
 TASKS: dict[str, type[Any]] = {
     "pendulum": Pendulum,
     "cartpole": CartPole,

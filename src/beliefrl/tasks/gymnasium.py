@@ -84,7 +84,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         except UserError:
             raise
         except Exception as error:  # whatever a stranger's environment may raise
-            raise UserError(f"{task.name} cannot be made: {_said(error)}.") from None
+            raise UserError(f"{task.name} cannot be made: {said(error)}.") from None
         self.inner_action_space: Any = getattr(self.inner, "action_space", None)
         self.inner_observation_space: Any = getattr(self.inner, "observation_space", None)
         self._check_actions(self.inner_action_space)
@@ -163,7 +163,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         try:
             result = function()
         except (Exception, SystemExit) as error:  # whatever a stranger's environment may raise
-            raise self._fault(f"{name} raised {_said(error)}") from None
+            raise self._fault(f"{name} raised {said(error)}") from None
         space = self.inner.action_space
         if space is not self.inner_action_space and space != self.inner_action_space:
             raise self._fault(
@@ -254,7 +254,7 @@ def _array(value: Any) -> np.ndarray:
         return np.empty(0, object)
 
 
-def _said(error: BaseException) -> str:
+def said(error: BaseException) -> str:
     """An exception on one line."""
     text = " ".join(str(error).split())[:300].rstrip(".")
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
