@@ -170,7 +170,7 @@ def test_a_short_episode_is_seen_to_its_half(tmp_path):
         ("sac-lstm", {}, "is of sac-lstm, which has no model"),
         ("vrm-keep", {"model": "first"}, "vrm-keep has no model 'first': it has keep"),
         ("slac", {"model": "keep"}, "slac has no model 'keep': it has latent"),
-        ("vrm", {"start": 13}, "start=13 is impossible: the episode has 13 moments, so give 12 or less"),
+        ("slac", {"start": 13}, "start=13 is impossible: the episode has 13 moments, so give 12 or less"),
     ],
 )
 def test_what_cannot_be_predicted_is_told_in_a_sentence(tmp_path, name, changes, sentence):
@@ -186,7 +186,8 @@ def test_the_figure_has_a_row_for_each_entry_that_is_asked_for(tmp_path):
     for entries in ((2, 0), (0,), None):
         path = prediction.draw_predictions(predicted, tmp_path / "picture", entries)
         assert path == tmp_path / "picture.png"
-        heights[entries] = Image.open(path).height
+        with Image.open(path) as image:
+            heights[entries] = image.height
         assert (tmp_path / "picture.pdf").read_bytes().startswith(b"%PDF")
     assert heights[None] == heights[2, 0] > heights[0,]
     with pytest.raises(UserError, match="entries=1 is impossible: the agent sees 2, 0 of the observation"):
