@@ -51,6 +51,7 @@ MISTAKES = {
     "sweep": "Nothing is named to run",
     "sweep --agents vrm": "Nothing is named to run",
     "sweep --out there": "Nothing is named to run",
+    "sweep --out there --steps 5": "Nothing is named to run",
     "sweep mine.py": "no file mine.py",
     "sweep there/file --agents vrm": "leave --preset, --agents and --tasks out",
     "sweep --preset paper": "--preset must be one of",

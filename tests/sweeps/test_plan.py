@@ -8,7 +8,7 @@ import pytest
 from beliefrl import tasks
 from beliefrl.sweeps import plan as plans
 from beliefrl.sweeps import presets
-from beliefrl.sweeps.plan import Experiment, grid, load, plan, read, shrunk, write
+from beliefrl.sweeps.plan import Experiment, extended, grid, load, plan, read, shrunk, write
 from beliefrl.types import UserError
 
 
@@ -42,6 +42,18 @@ def test_first_seeds_come_first():
 def test_seeds_share_a_program_where_that_pays(agent, task, together, runs):
     trainings = plan([Experiment(agent, task, seeds=(2, 0, 1, 5))], together)
     assert [training.seeds for training in trainings] == runs
+
+
+def test_a_sweep_that_grows_trains_no_seed_twice():
+    before = plan(grid(["vrm", "sac-mlp"], ["pendulum"], seeds=3, steps=10))
+    grown = extended(before, grid(["vrm", "sac-mlp"], ["pendulum"], seeds=5, steps=20))
+    seeds = {agent: [each.seeds for each in grown if each.agent == agent] for agent in ("vrm", "sac-mlp")}
+    assert seeds == {"vrm": [[0], [1], [2], [3], [4]], "sac-mlp": [[0, 1, 2], [3, 4]]}
+    assert all(each.steps == 20 for each in grown)
+    assert extended(grown, grid(["vrm"], ["pendulum"], seeds=5, steps=20), seeds_per_run=5) == grown
+    other = extended(grown, grid(["vrm"], ["pendulum"], {"gamma": [0.9]}, seeds=1))
+    assert [each.name for each in other[len(grown) :]] == ["vrm-pendulum-gamma=0.9-seed0"]
+    assert extended(before, []) == before
 
 
 def test_a_training_is_a_command_that_says_everything(tmp_path):

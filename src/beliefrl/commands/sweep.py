@@ -45,7 +45,7 @@ class SweepOptions:
     workers: int | None = None
     """Most trainings at a time. None: as many as there are cores (or GPUs)."""
     seeds_per_run: int | None = None
-    """Seeds trained side by side in one program. None: one on a core, all on a GPU."""
+    """Seeds trained side by side in one program. None: one on a core (of sac-mlp all), all on a GPU."""
     ray: Annotated[str | None, tyro.conf.arg(metavar="auto|ADDRESS")] = None
     """Run on the Ray cluster whose head is at ADDRESS (HOST:PORT), or on this machine (auto). Needs the extra `sweep`,
     and a folder that all of its machines see."""
@@ -95,7 +95,7 @@ def _experiments(options: SweepOptions) -> list:
         chosen = presets.preset(options.preset, options.tasks, options.agents, numbers)
     elif options.agents and options.tasks:
         chosen = plan.grid(options.agents, options.tasks, seeds=numbers or range(options.seed, options.seed + 5))
-    elif options.out is not None and plan.read(options.out) and not (options.agents or options.tasks):
+    elif options.out is not None and _only_where(options) and plan.read(options.out):
         return []
     else:
         raise UsageError(
@@ -103,6 +103,12 @@ def _experiments(options: SweepOptions) -> list:
         )
     chosen = _with_settings(chosen, options)
     return chosen if options.scale == 1 else [plan.shrunk(each, options.scale) for each in chosen]
+
+
+def _only_where(options: SweepOptions) -> bool:
+    """Whether nothing is said but where a sweep is and how it shall run."""
+    where = dataclasses.replace(SweepOptions(), out=options.out, workers=options.workers, ray=options.ray)
+    return options == dataclasses.replace(where, seeds_per_run=options.seeds_per_run)
 
 
 def _with_settings(experiments: list, options: SweepOptions) -> list:

@@ -147,6 +147,32 @@ def plan(experiments: Iterable[Experiment], seeds_per_run: int | None = None) ->
     return sorted(planned.values(), key=lambda training: turns[training.name])
 
 
+def extended(
+    before: Sequence[Training], experiments: Iterable[Experiment], seeds_per_run: int | None = None
+) -> list[Training]:
+    """The trainings of a sweep to which experiments are added; seeds that it has already stay in the runs they are in.
+
+    These take over what is new in their options, such as more steps. Arguments and errors are those of `plan`.
+    """
+    trainings, fresh = {training.name: training for training in before}, []
+    for experiment in experiments:
+        like, there = _training(experiment, 0, 1), set()
+        for training in [each for each in trainings.values() if _line(each) == _line(like)]:
+            if set(training.seeds) & set(experiment.seeds):
+                own = {name: training.options[name] for name in ("seed", "seeds")}
+                trainings[training.name] = dataclasses.replace(training, options=like.options | own)
+                there |= set(training.seeds)
+        fresh.append(dataclasses.replace(experiment, seeds=tuple(set(experiment.seeds) - there)))
+    _check(trainings.values())
+    return [*trainings.values(), *plan(fresh, seeds_per_run)]
+
+
+def _line(training: Training) -> tuple[Any, ...]:
+    """What trainings have in common that differ in their seeds only."""
+    settings = json.dumps([training.settings, training.constants], sort_keys=True, default=str)
+    return training.agent, training.task, settings, training.observe
+
+
 # Measured on two cores: two seeds of SAC-MLP in one program take 17 % less time than one after the other, and share
 # one compilation; the recurrent agents gain nothing.
 GAIN_SIDE_BY_SIDE = ("sac-mlp",)

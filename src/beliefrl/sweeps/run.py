@@ -77,7 +77,7 @@ def sweep(
         launcher = cluster.Cluster(folder, ray, workers) if ray else local.Local(folder, slots)
         on_gpu = launcher.has_gpus if isinstance(launcher, cluster.Cluster) else slots[0].startswith("gpu")
         together = seeds_per_run or (ALL if on_gpu else None)
-        status = _status(folder, plans.plan(experiments, together))
+        status = _status(folder, plans.extended(plans.read(folder), experiments, together))
         with Requests() as requests:
             try:
                 _loop(folder, status, launcher, report or (lambda status: None), requests)
@@ -93,11 +93,10 @@ def sweep(
 
 
 def _status(folder: pathlib.Path, trainings: Sequence[Training]) -> SweepStatus:
-    """Where a sweep stands whose folder has these added to it."""
-    planned = {training.name: training for training in (*plans.read(folder), *trainings)}
-    plans.write(folder, list(planned.values()))
-    finished = [training for training in planned.values() if training.is_finished(folder)]
-    return SweepStatus(finished, [training for training in planned.values() if training not in finished])
+    """Where a sweep stands that consists of these."""
+    plans.write(folder, trainings)
+    finished = [training for training in trainings if training.is_finished(folder)]
+    return SweepStatus(finished, [training for training in trainings if training not in finished])
 
 
 def _loop(folder: pathlib.Path, status: SweepStatus, launcher: Launcher, report: Report, requests: Requests) -> None:
