@@ -26,3 +26,18 @@ def test_a_second_signal_ends_the_program_at_once():
             assert process.wait(timeout=20) == 130
         finally:
             process.kill()
+
+
+def test_signals_that_come_together_are_one_request():
+    with subprocess.Popen([sys.executable, "-c", SLEEPER], stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout.readline() == "ready\n"
+            for _ in range(3):
+                process.send_signal(signal.SIGTERM)
+                time.sleep(0.02)
+            time.sleep(0.5)
+            assert process.poll() is None
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(timeout=20) == 143
+        finally:
+            process.kill()

@@ -4,10 +4,12 @@ import os
 import signal
 import socket
 import threading
+import time
 from types import FrameType
 from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+ONE_REQUEST = 0.3  # seconds in which several are one: a parent that dies may send one for each of its threads
 
 
 class Stopped(KeyboardInterrupt):
@@ -19,7 +21,7 @@ class Stopped(KeyboardInterrupt):
 
 
 class Requests:
-    """While entered, the first signal is kept in `number`; a second one ends the program in that moment.
+    """While entered, the first signal is kept in `number`; a second one, if not at once, ends the program in that moment.
 
     Python runs handlers between two of its own instructions, so one that comes while a compiled function runs waits
     for it. The second is therefore watched for by a thread, which the system tells of each signal at once.
@@ -55,9 +57,11 @@ class Requests:
             self.number = number
 
     def _watch(self, ours: socket.socket) -> None:
-        seen = 0
+        first = None
         with ours:
             while told := ours.recv(1):
-                seen += told[0] in SIGNALS
-                if seen > 1:
-                    os._exit(128 + told[0])
+                if told[0] in SIGNALS:
+                    now = time.monotonic()
+                    first = now if first is None else first
+                    if now - first > ONE_REQUEST:
+                        os._exit(128 + told[0])

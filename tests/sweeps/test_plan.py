@@ -8,7 +8,8 @@ import pytest
 from beliefrl import tasks
 from beliefrl.sweeps import plan as plans
 from beliefrl.sweeps import presets
-from beliefrl.sweeps.plan import Experiment, extended, grid, load, plan, read, shrunk, write
+from beliefrl.sweeps.files import load, read, write
+from beliefrl.sweeps.plan import Experiment, extended, grid, plan, shrunk
 from beliefrl.types import UserError
 
 

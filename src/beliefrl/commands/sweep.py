@@ -76,7 +76,7 @@ def sweep(argv: Sequence[str]) -> None:
 def _experiments(options: SweepOptions) -> list:
     """What the command line asks for."""
     from beliefrl.schedule import Options
-    from beliefrl.sweeps import plan, presets
+    from beliefrl.sweeps import files, plan, presets
     from beliefrl.types import check_range
 
     check_range(options, ("scale",), 0, 1)
@@ -89,13 +89,13 @@ def _experiments(options: SweepOptions) -> list:
     if options.file is not None:
         if options.preset or options.agents or options.tasks:
             raise UsageError("A FILE says which agents and tasks: leave --preset, --agents and --tasks out.")
-        chosen = plan.load(options.file)
+        chosen = files.load(options.file)
         chosen = [dataclasses.replace(each, seeds=tuple(numbers)) for each in chosen] if numbers else chosen
     elif options.preset is not None:
         chosen = presets.preset(options.preset, options.tasks, options.agents, numbers)
     elif options.agents and options.tasks:
         chosen = plan.grid(options.agents, options.tasks, seeds=numbers or range(options.seed, options.seed + 5))
-    elif options.out is not None and _only_where(options) and plan.read(options.out):
+    elif options.out is not None and _only_where(options) and files.read(options.out):
         return []
     else:
         raise UsageError(

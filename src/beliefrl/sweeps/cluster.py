@@ -13,8 +13,9 @@ import sys
 import time
 from typing import Any
 
+from beliefrl.sweeps.files import PLAN
 from beliefrl.sweeps.local import environment
-from beliefrl.sweeps.plan import PLAN, Training
+from beliefrl.sweeps.plan import Training
 from beliefrl.types import UserError
 
 RETRIES = 3  # of a training whose machine is lost

@@ -10,22 +10,18 @@ A sweep's folder:
 
 import dataclasses
 import hashlib
-import importlib.util
 import itertools
 import json
-import os
 import pathlib
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from beliefrl import agents, tasks
-from beliefrl.arrays import write_whole
 from beliefrl.runs import Run
 from beliefrl.schedule import Options, capacity
 from beliefrl.types import UserError
 
-PLAN = "sweep.json"
 OPTIONS = tuple(field.name for field in dataclasses.fields(Options))
 SHRINKS = ("step_start_rl", "train_times_fivrm", "pretrain_updates")  # hyperparameters that count steps or updates
 LONGEST_NAME = 120  # of a folder
@@ -193,8 +189,8 @@ def _stretches(experiment: Experiment, seeds_per_run: int | None) -> list[tuple[
 
 def _training(experiment: Experiment, first: int, count: int) -> Training:
     settings, options = _split(experiment.settings)
-    told = [f"{name}={value}" for name, value in {**settings, **dict(experiment.constants)}.items()]
-    seen = [f"observe={','.join(map(str, experiment.observe))}"] if experiment.observe else []
+    told = [f"{name}={_words(value)}" for name, value in {**settings, **dict(experiment.constants)}.items()]
+    seen = [f"observe={_words(experiment.observe)}"] if experiment.observe else []
     seeds = f"seed{first}" + (f"to{first + count - 1}" if count > 1 else "")
     name = re.sub(r"[^\w.=,-]+", "-", "-".join([experiment.agent, experiment.task, *told, *seen]))
     if len(name) > LONGEST_NAME:
@@ -209,6 +205,10 @@ def _training(experiment: Experiment, first: int, count: int) -> Training:
         tuple(experiment.observe),
         dict(experiment.constants),
     )
+
+
+def _words(value: Any) -> str:
+    return ",".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
 
 
 def _split(settings: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -251,50 +251,3 @@ def _flag(name: str, value: Any) -> list[str]:
     if isinstance(value, bool):
         return [f"--{option}" if value else f"--no-{option}"]
     return [f"--{option}", *(map(str, value) if isinstance(value, list | tuple) else [str(value)])]
-
-
-def load(path: str | os.PathLike[str]) -> list[Experiment]:
-    """The `experiments` of a Python file.
-
-    Raises:
-        UserError: there is no such file, it raises, or has no such list.
-    """
-    path = pathlib.Path(path)
-    if not path.is_file():
-        raise UserError(f"There is no file {path}: give a Python file that makes a list `experiments`.")
-    spec = importlib.util.spec_from_file_location("beliefrl_sweep", path)
-    if spec is None or spec.loader is None:
-        raise UserError(f"{path} is no Python file: its name must end with .py.")
-    module = importlib.util.module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
-    except UserError:
-        raise
-    except Exception as error:  # whatever a user's file may raise
-        raise UserError(f"{path} cannot be run: {type(error).__name__}: {error}.") from None
-    found = getattr(module, "experiments", None)
-    if not isinstance(found, list | tuple) or not all(isinstance(each, Experiment) for each in found):
-        raise UserError(f"{path} makes no list `experiments` of beliefrl.Experiment: beliefrl.grid(...) gives one.")
-    return list(found)
-
-
-def read(sweep: pathlib.Path) -> list[Training]:
-    """The trainings in a sweep's folder; none, if there is no sweep yet.
-
-    Raises:
-        UserError: its sweep.json is damaged.
-    """
-    path = sweep / PLAN
-    try:
-        written = json.loads(path.read_text())["trainings"]
-        return [Training(**{**each, "observe": tuple(each["observe"])}) for each in written]
-    except FileNotFoundError:
-        return []
-    except (OSError, ValueError, KeyError, TypeError):
-        raise UserError(f"{path} is damaged: restore it, or remove it and give the sweep anew.") from None
-
-
-def write(sweep: pathlib.Path, trainings: Sequence[Training]) -> None:
-    """Write down the trainings of a sweep."""
-    content = {"format": 1, "trainings": [dataclasses.asdict(training) for training in trainings]}
-    write_whole(sweep / PLAN, (json.dumps(content, indent=1, default=str) + "\n").encode())

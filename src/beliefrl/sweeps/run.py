@@ -9,7 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from beliefrl import runs
 from beliefrl.stop import Requests, Stopped
-from beliefrl.sweeps import cluster, local
+from beliefrl.sweeps import cluster, files, local
 from beliefrl.sweeps import plan as plans
 from beliefrl.sweeps.plan import Experiment, Training
 from beliefrl.types import UserError
@@ -77,7 +77,7 @@ def sweep(
         launcher = cluster.Cluster(folder, ray, workers) if ray else local.Local(folder, slots)
         on_gpu = launcher.has_gpus if isinstance(launcher, cluster.Cluster) else slots[0].startswith("gpu")
         together = seeds_per_run or (ALL if on_gpu else None)
-        status = _status(folder, plans.extended(plans.read(folder), experiments, together))
+        status = _status(folder, plans.extended(files.read(folder), experiments, together))
         with Requests() as requests:
             try:
                 _loop(folder, status, launcher, report or (lambda status: None), requests)
@@ -94,7 +94,7 @@ def sweep(
 
 def _status(folder: pathlib.Path, trainings: Sequence[Training]) -> SweepStatus:
     """Where a sweep stands that consists of these."""
-    plans.write(folder, trainings)
+    files.write(folder, trainings)
     finished = [training for training in trainings if training.is_finished(folder)]
     return SweepStatus(finished, [training for training in trainings if training not in finished])
 
