@@ -21,7 +21,7 @@ class Stopped(KeyboardInterrupt):
 
 
 class Requests:
-    """While entered, the first signal is kept in `number`; a second one, if not at once, ends the program in that moment.
+    """While entered, the first signal is kept in `number`; a later one ends the program in that moment.
 
     Python runs handlers between two of its own instructions, so one that comes while a compiled function runs waits
     for it. The second is therefore watched for by a thread, which the system tells of each signal at once.
