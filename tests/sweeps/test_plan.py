@@ -37,6 +37,7 @@ def test_first_seeds_come_first():
         ("sac-mlp", "pendulum", None, [[0, 1, 2], [5]]),
         ("sac-mlp", "pendulum", 1, [[0], [1], [2], [5]]),
         ("vrm", "pendulum", 2, [[0, 1], [2], [5]]),
+        ("sac-mlp", "cartpole-p", None, [[0, 1, 2], [5]]),
         ("sac-mlp", "gym:Pendulum-v1", None, [[0], [1], [2], [5]]),
     ],
 )

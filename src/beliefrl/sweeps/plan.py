@@ -176,7 +176,8 @@ GAIN_SIDE_BY_SIDE = ("sac-mlp",)
 
 def _stretches(experiment: Experiment, seeds_per_run: int | None) -> list[tuple[int, int]]:
     """The experiment's seeds cut into runs: (first, how many), no more than `seeds_per_run` and without a gap."""
-    gains = experiment.agent in GAIN_SIDE_BY_SIDE and experiment.task in tasks.names() and not experiment.observe
+    compiled = experiment.task.removesuffix("-v").removesuffix("-p") in tasks.TASKS
+    gains = compiled and experiment.agent in GAIN_SIDE_BY_SIDE
     most = seeds_per_run or (len(experiment.seeds) if gains else 1)
     cut: list[tuple[int, int]] = []
     for seed in sorted(experiment.seeds):

@@ -57,7 +57,7 @@ def sweep(
     """Train what experiments consist of, as many at a time as there is room for; those that fail are noted.
 
     Args:
-        experiments: `beliefrl.grid(...)`, or a list of `beliefrl.Experiment`. None: what `out` has is gone on with.
+        experiments: `beliefrl.grid(...)`, or a list of `beliefrl.Experiment`. Empty: what `out` has goes on.
         out: the sweep's folder. What is finished in it is not done again, what was stopped goes on.
         workers: most trainings at a time, on a core each; None: as many as there are cores, or GPUs. 0: one at a time,
             with all the cores.
