@@ -17,16 +17,22 @@ def test_the_forecast_is_what_is_left_at_the_pace_seen(tmp_path, monkeypatch):
     forecast = Forecast(tmp_path)
     forecast.watch(status)
     assert forecast.seconds_left(status) is None
+    now[0] = 30.0  # until they learn
     for index, training in enumerate((first, second)):
-        a_run(tmp_path / training.name, [[]], first=index, updates=[(40, {"loss": 1.0})])
-    now[0] = 80.0  # 2 s a step
+        a_run(tmp_path / training.name, [[]], first=index, updates=[(20, {"loss": 1.0})])
+    forecast.watch(status)
+    assert forecast.seconds_left(status) is None
+    now[0] = 70.0  # 2 s a step
+    for index, training in enumerate((first, second)):
+        row = {"step": 40, "kind": "update", "loss": 1.0}
+        (tmp_path / training.name / "metrics" / f"seed-{index}.jsonl").write_text(json.dumps(row) + "\n")
     forecast.watch(status)
     assert [each.step for each in forecast.going.values()] == [40, 40]
-    assert forecast.seconds_left(status) == (2 * 60 + 2 * 60 + 2 * 100) / 2
+    assert forecast.seconds_left(status) == (2 * 60 + 2 * 60 + 30 + 2 * 100) / 2
     status = SweepStatus([first, second], [], {third.name: third})
     forecast.watch(status)
     assert list(forecast.going) == [third.name]
-    assert forecast.seconds_left(status) == 200
+    assert forecast.seconds_left(status) == 30 + 200
 
 
 def test_what_a_training_does_is_read_off_its_last_lines(tmp_path):

@@ -3,11 +3,19 @@
 import pathlib
 import statistics
 import time
+from typing import NamedTuple
 
 from beliefrl.runs import Run
 from beliefrl.sweeps.plan import Training
 from beliefrl.sweeps.run import SweepStatus
 from beliefrl.types import UserError
+
+
+class Pace(NamedTuple):
+    """What a training of an agent takes."""
+
+    before: float  # seconds until it learns: starting, compiling, pre-training
+    per_step: float  # seconds for an environment step of all its seeds together, once it learns
 
 
 class Progress:
@@ -17,8 +25,7 @@ class Progress:
         """`folder` is the sweep's."""
         self.training, self._path = training, folder / training.name
         self.step, self.doing, self.last_return = 0, "starting", None
-        self.read()
-        self.began, self._first_step = time.monotonic(), self.step  # of a training that goes on, where it was
+        self._began, self._learns_since = time.monotonic(), None
 
     def read(self) -> None:
         """Look again at what is new."""
@@ -35,12 +42,16 @@ class Progress:
                 self.doing = "learning"
             elif row["kind"] == "evaluation":
                 self.last_return = statistics.fmean(row["sampled"])
+        if self.doing == "learning" and self._learns_since is None:
+            self._learns_since = time.monotonic(), self.step
 
     @property
-    def seconds_per_step(self) -> float | None:
-        """Of all its seeds together since it was started; None before a tenth of it is done."""
-        done = self.step - self._first_step
-        return (time.monotonic() - self.began) / done if done >= self.training.steps / 10 else None
+    def pace(self) -> Pace | None:
+        """None before it has learned for a while."""
+        if self._learns_since is None or self.step <= self._learns_since[1]:
+            return None
+        since, first_step = self._learns_since
+        return Pace(since - self._began, (time.monotonic() - since) / (self.step - first_step))
 
 
 class Forecast:
@@ -49,7 +60,7 @@ class Forecast:
     def __init__(self, folder: pathlib.Path):
         self.folder = folder
         self.going: dict[str, Progress] = {}
-        self._seen: dict[str, float] = {}  # seconds per step of each agent
+        self._seen: dict[str, Pace] = {}  # of each agent, the latest
 
     def watch(self, status: SweepStatus) -> None:
         """Look at every training that is going on."""
@@ -58,18 +69,19 @@ class Forecast:
         for name, training in status.running.items():
             progress = self.going.setdefault(name, Progress(self.folder, training))
             progress.read()
-            if progress.seconds_per_step is not None:
-                self._seen[training.agent] = progress.seconds_per_step
+            if progress.pace is not None:
+                self._seen[training.agent] = progress.pace
 
     def seconds_left(self, status: SweepStatus) -> float | None:
         """Until all of the sweep is done, at the pace seen so far; None before there was any."""
         if not self._seen:
             return None
-        usual = statistics.fmean(self._seen.values())
+        usual = Pace(*map(statistics.fmean, zip(*self._seen.values(), strict=True)))
 
-        def seconds(training: Training, steps: int) -> float:
-            return max(steps, 0) * self._seen.get(training.agent, usual)
+        def seconds(training: Training, done: int, learns: bool) -> float:
+            pace = self._seen.get(training.agent, usual)
+            return max(training.steps - done, 0) * pace.per_step + (0.0 if learns else pace.before)
 
-        going = [seconds(each.training, each.training.steps - each.step) for each in self.going.values()]
-        waiting = sum(seconds(training, training.steps) for training in status.waiting)
+        going = [seconds(each.training, each.step, each.doing == "learning") for each in self.going.values()]
+        waiting = sum(seconds(training, 0, False) for training in status.waiting)
         return max((waiting + sum(going)) / max(len(going), 1), *going, 0.0)
