@@ -103,6 +103,7 @@ def test_beyond_a_termination_there_is_no_value():
     assert float(metrics["q"][0]) == pytest.approx(1.0, abs=0.05)
 
 
+@pytest.mark.slow
 def test_beyond_a_time_limit_there_is_value():
     """1 + 0.5 + 0.25 + ... = 2, although no episode has more than 2 steps."""
     metrics, _ = learn(Constant(max_steps=2), 800, gamma=0.5, **GREEDY)

@@ -89,6 +89,7 @@ def test_every_agent_goes_on_to_the_last_bit(tmp_path, name):
     assert files(tmp_path / "run") == files(tmp_path / "whole")
 
 
+@pytest.mark.slow
 def test_a_finished_training_can_be_made_longer(whole, tmp_path):
     folder, _ = whole
     train(AGENT, "pendulum-v", tmp_path / "run", **OPTIONS | {"steps": 120})
@@ -142,6 +143,7 @@ def test_a_log_that_was_cut_is_told(whole, tmp_path):
         resume(tmp_path / "run")
 
 
+@pytest.mark.slow
 def test_an_environment_goes_on_from_the_start_of_an_episode(tmp_path):
     task, notes = GymnasiumTask(Fine, "fine"), []
     with pytest.raises(Crash):

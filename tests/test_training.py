@@ -157,6 +157,7 @@ assert beliefrl.evaluate(run, episodes=1)["episodes"] == 1
         assert (tmp_path / "run" / name).read_text() == (folder / name).read_text()
 
 
+@pytest.mark.slow
 def test_a_killed_training_can_be_evaluated_and_success_is_reported(tmp_path):
     folder = tmp_path / "run"
     options = OPTIONS | {"steps": 1_000_000, "seeds": 1, "eval_every": 50}
