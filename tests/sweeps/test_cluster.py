@@ -1,4 +1,4 @@
-"""Sweeps on a real Ray cluster of two nodes on this machine. Needs the extra `sweep`."""
+"""Sweeps on a real Ray cluster of two nodes on this machine, as a user starts them. Needs the extra `sweep`."""
 
 import contextlib
 import os
@@ -7,28 +7,21 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 
 import pytest
 
 from beliefrl import sweep
-from beliefrl.stop import Stopped
 from beliefrl.sweeps.plan import grid
 from beliefrl.types import UserError
 
-ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'beliefrl[sweep]'.")
+pytest.importorskip("ray", reason="Ray is not installed: pip install 'beliefrl[sweep]'.")
 pytestmark = pytest.mark.slow
 
-QUICK = {
-    "steps": 300,
-    "eval_every": 100,
-    "eval_episodes": 1,
-    "step_start_rl": 100,
-    "pretrain_updates": 5,
-    "policy_layers": [8],
-    "value_layers": [8],
-}
 RAY = pathlib.Path(sys.executable).parent / "ray"
+SWEEP = [sys.executable, "-m", "beliefrl.cli", "sweep"]
+SETTINGS = "eval_episodes=1 step_start_rl=100 pretrain_updates=5 policy_layers=[8] value_layers=[8]"
 
 
 def free_port():
@@ -43,69 +36,91 @@ def ray_command(*arguments):
 
 
 @pytest.fixture
-def head():
+def alone():
+    """Waits until no other test has a cluster: `ray stop` stops all that are on this machine."""
+    fcntl = pytest.importorskip("fcntl")
+    with (pathlib.Path(tempfile.gettempdir()) / "beliefrl-tests-of-ray").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+@pytest.fixture
+def head(alone):
     """The address of a cluster of two nodes with one core each."""
     ray_command("stop", "--force")
     address = f"127.0.0.1:{free_port()}"
-    started = ray_command(
-        *("start", "--head", f"--port={address.split(':')[1]}", "--num-cpus=1", "--include-dashboard=false")
-    )
+    port = f"--port={address.split(':')[1]}"
+    started = ray_command("start", "--head", port, "--num-cpus=1", "--include-dashboard=false")
     assert started.returncode == 0, started.stderr
     joined = ray_command("start", f"--address={address}", "--num-cpus=1")
     assert joined.returncode == 0, joined.stderr
     yield address
-    ray.shutdown()
     ray_command("stop", "--force")
+
+
+def begin(out, head, line):
+    """The program, as it sweeps on the cluster."""
+    command = [*SWEEP, *line.split(), "--out", str(out), "--ray", head]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
 def rows(folder):
     return {path.parts[-3]: path.read_text() for path in folder.glob("*/metrics/seed-*.jsonl")}
 
 
+def wait_until_it_learns(folder, process):
+    while not any('"update"' in text for text in rows(folder).values()):
+        assert process.poll() is None, process.stdout.read()
+        time.sleep(0.1)
+
+
+LONG = "--agents sac-mlp --tasks pendulum-v --seeds 1 --steps 12000 --set eval_every=6000 checkpoint_steps=1000 "
+LONG += SETTINGS
+
+
 def test_a_cluster_trains_what_this_machine_would(tmp_path, head):
-    experiments = grid(["sac-mlp"], ["pendulum-v", "pendulum-p"], seeds=1, **QUICK)
-    at_a_time = []
-    sweep(experiments, tmp_path / "there", ray=head, report=lambda status: at_a_time.append(len(status.running)))
-    assert max(at_a_time) == 2  # a node has one core, so both were at work
-    sweep(experiments, tmp_path / "here")
-    assert rows(tmp_path / "there") == rows(tmp_path / "here")
-    assert len(rows(tmp_path / "there")) == 2
+    line = f"--agents sac-mlp --tasks pendulum-v pendulum-p --seeds 1 --steps 300 --set eval_every=100 {SETTINGS}"
+    process = begin(tmp_path / "there", head, line)
+    said, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, said
+    assert "2 trainings, 2 at a time" in said  # a node has one core, so both were at work
+    settings = {"eval_every": 100, "eval_episodes": 1, "step_start_rl": 100, "pretrain_updates": 5}
+    layers = {"policy_layers": [8], "value_layers": [8]}
+    sweep(grid(["sac-mlp"], ["pendulum-v", "pendulum-p"], seeds=1, steps=300, **settings, **layers), tmp_path / "here")
+    there, here = rows(tmp_path / "there"), rows(tmp_path / "here")
+    assert len(there) == 2
+    assert sorted(there.values()) == sorted(here.values())
 
 
 def test_a_sweep_on_a_cluster_can_be_stopped_and_goes_on(tmp_path, head):
-    experiments = grid(["sac-mlp"], ["pendulum-v"], seeds=1, **(QUICK | {"steps": 1500, "checkpoint_steps": 100}))
-
-    def stop(status):
-        if any('"update"' in text for text in rows(tmp_path / "sweep").values()):
-            os.kill(os.getpid(), signal.SIGINT)
-
-    with pytest.raises(Stopped):
-        sweep(experiments, tmp_path / "sweep", ray=head, report=stop)
-    (folder,) = (path.parent for path in (tmp_path / "sweep").glob("*/config.json"))
+    process = begin(tmp_path, head, LONG)
+    wait_until_it_learns(tmp_path, process)
+    process.send_signal(signal.SIGINT)
+    said, _ = process.communicate(timeout=300)
+    assert process.returncode == 130, said
+    assert "stopped with 0 of 1 trainings finished" in said
+    (folder,) = (path.parent for path in tmp_path.glob("*/config.json"))
     assert not (folder / "results.json").exists()
     assert list((folder / "checkpoints").iterdir())
-    assert len(sweep([], tmp_path / "sweep", ray=head).finished) == 1
+    again = begin(tmp_path, head, "")
+    said, _ = again.communicate(timeout=300)
+    assert again.returncode == 0, said
+    assert "1 of 1 trainings finished" in said
 
 
 def test_a_training_whose_worker_dies_goes_on_by_itself(tmp_path, head):
-    experiments = grid(["sac-mlp"], ["pendulum-v"], seeds=1, **(QUICK | {"steps": 1500, "checkpoint_steps": 100}))
-    killed = []
-
-    def kill(status):
-        if not killed and any('"update"' in text for text in rows(tmp_path / "sweep").values()):
-            out = subprocess.run(["pgrep", "-f", "ray::.*train_there"], capture_output=True, text=True).stdout
-            for process in out.split():
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(int(process), signal.SIGKILL)
-                killed.append(process)
-
-    status = sweep(experiments, tmp_path / "sweep", ray=head, report=kill)
-    assert killed
-    assert len(status.finished) == 1
+    process = begin(tmp_path, head, LONG)
+    wait_until_it_learns(tmp_path, process)
+    out = subprocess.run(["pgrep", "-f", "ray::.*train_there"], capture_output=True, text=True).stdout
+    assert out.split()
+    for worker in out.split():
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(int(worker), signal.SIGKILL)
+    said, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, said
+    assert "1 of 1 trainings finished" in said
 
 
 def test_where_there_is_no_cluster_is_told(tmp_path):
-    before = time.monotonic()
     with pytest.raises(UserError, match=r"There is no Ray cluster at 127.0.0.1"):
         sweep(grid(["sac-mlp"], ["pendulum"], seeds=1), tmp_path, ray=f"127.0.0.1:{free_port()}")
-    assert time.monotonic() > before

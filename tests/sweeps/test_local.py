@@ -79,10 +79,10 @@ def test_a_sweep_is_its_trainings_and_a_failure_harms_no_other(tmp_path):
     """The log of a seed is that of the same training alone; an environment that breaks is told at the end."""
     experiments = [
         *grid(["sac-mlp"], ["pendulum-v"], seeds=2, **QUICK),
-        Experiment("sac-mlp", "gym:wrong:Raises-v0", QUICK, seeds=(0,)),
+        Experiment("sac-mlp", "gym:wheels:Raises-v0", QUICK, seeds=(0,)),
     ]
-    wrong = tmp_path / "wrong.py"
-    wrong.write_text(
+    module = tmp_path / "wheels.py"
+    module.write_text(
         "import gymnasium\n"
         "class Raises(gymnasium.Env):\n"
         "    observation_space = gymnasium.spaces.Box(-1, 1, (1,))\n"
@@ -94,7 +94,7 @@ def test_a_sweep_is_its_trainings_and_a_failure_harms_no_other(tmp_path):
         "        self.steps += 1\n"
         "        if self.steps > 150: raise RuntimeError('the wheel came off')\n"
         "        return self.observation_space.sample(), 0.0, False, False, {}\n"
-        "gymnasium.register('Raises-v0', 'wrong:Raises', max_episode_steps=200)\n"
+        "gymnasium.register('Raises-v0', 'wheels:Raises', max_episode_steps=200)\n"
     )
     with contextlib.chdir(tmp_path):
         sys.path.insert(0, "")
@@ -111,7 +111,12 @@ def test_a_sweep_is_its_trainings_and_a_failure_harms_no_other(tmp_path):
 
 @pytest.mark.slow
 def test_a_sweep_that_was_stopped_goes_on_where_it_was(tmp_path):
-    experiments = grid(["sac-mlp"], ["pendulum-v"], seeds=2, **(QUICK | {"steps": 1500, "checkpoint_steps": 100}))
+    experiments = grid(
+        ["sac-mlp"],
+        ["pendulum-v"],
+        seeds=2,
+        **(QUICK | {"steps": 12_000, "eval_every": 6_000, "checkpoint_steps": 1_000}),
+    )
 
     def stop(status):
         begun = [path for path in tmp_path.glob("stopped/*/metrics/seed-0.jsonl") if '"update"' in path.read_text()]
