@@ -87,7 +87,7 @@ def _kind(path: pathlib.Path) -> str:
         raise UserError(f"{path} is impossible: a film is an mp4 or a gif, so end its name as .mp4 or .gif.")
     if kind == ".mp4":
         try:
-            import imageio_ffmpeg  # noqa: F401
+            import imageio_ffmpeg  # noqa: F401  # pyright: ignore[reportMissingImports]
         except ImportError:
             raise UserError("An mp4 needs imageio-ffmpeg: pip install 'beliefrl[video]', or make a .gif.") from None
     return kind
@@ -135,7 +135,7 @@ def _written(path: pathlib.Path, kind: str, fps: float) -> Iterator[Writer]:
 @contextmanager
 def _mp4(path: pathlib.Path, fps: float) -> Iterator[Writer]:
     """H.264 that any player shows; frames go to ffmpeg one by one."""
-    import imageio_ffmpeg
+    import imageio_ffmpeg  # pyright: ignore[reportMissingImports]
 
     # Its own writer forks a process in which JAX runs threads, which may never return.
     encoding = [

@@ -54,7 +54,7 @@ class WandB:
     is_whole = False
 
     def __init__(self, folder: pathlib.Path, seed: int, config: dict[str, Any]):
-        import wandb
+        import wandb  # pyright: ignore[reportMissingImports]
 
         name = f"{folder.name}-seed-{seed}"
         self._run = wandb.init(

@@ -31,7 +31,7 @@ class Cluster:
             UserError: Ray is not installed, or there is no such cluster.
         """
         try:
-            import ray
+            import ray  # pyright: ignore[reportMissingImports]
         except ImportError:
             raise UserError("--ray needs Ray: pip install 'beliefrl[sweep]'.") from None
         self._ray, self.sweep, self._workers = ray, sweep.absolute(), workers
