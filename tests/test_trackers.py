@@ -1,6 +1,7 @@
 """Where numbers go besides a run's own logs, and that nothing else happens."""
 
 import importlib.util
+import json
 import os
 import subprocess
 import sys
@@ -8,8 +9,9 @@ import sys
 import numpy as np
 import pytest
 
-from beliefrl import Options, UserError, trackers
+from beliefrl import Options, UserError, resume, trackers
 from beliefrl.runs import Recorder
+from written import a_run, flat
 
 CONFIG = {"agent": "vrm", "hyperparameters": {}, "task": "pendulum", "constants": {}, "started": "2026-01-01T00:00:00"}
 
@@ -93,11 +95,24 @@ def test_tensorboard_has_event_files(tmp_path):
     ]
 
 
-def test_a_package_that_is_missing_is_told_before_anything_is_made(monkeypatch):
+def went_on_elsewhere(folder):
+    """A run with a checkpoint that was told to Weights & Biases on another machine."""
+    run = a_run(folder / "run", [flat(1.0)])
+    config = run.config | {"options": run.config["options"] | {"track": ["wandb"]}}
+    (run.folder / "config.json").write_text(json.dumps(config))
+    checkpoint = run.folder / "checkpoints" / "000001-step-10"
+    checkpoint.mkdir(parents=True)
+    (checkpoint / "manifest.json").write_text("{}")
+    return run.folder
+
+
+def test_a_package_that_is_missing_is_told_before_anything_is_made(tmp_path, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(UserError, match=r"pip install 'beliefrl\[wandb\]'"):
         trackers.check(("wandb",))
     trackers.check(("tensorboard",))
+    with pytest.raises(UserError, match=r"pip install 'beliefrl\[wandb\]'"):
+        resume(went_on_elsewhere(tmp_path))
     assert Options().track == ("tensorboard",)
 
 
@@ -111,6 +126,7 @@ def connect(self, address):
     return real(self, address)
 socket.socket.connect = connect
 from beliefrl.runs import Recorder
+from written import a_run, flat
 config = {"agent": "vrm", "hyperparameters": {}, "task": "pendulum", "constants": {}, "started": "2026-01-01T00:00:00"}
 run = Recorder(sys.argv[1], {**config, "options": {"seed": 0, "seeds": 2, "track": ["wandb"]}})
 for seed in (0, 1):

@@ -79,7 +79,7 @@ def agent_of(run: Run) -> Agent:
     Raises:
         UserError: it is unknown here.
     """
-    return agents.make(run.config["agent"], **_tuples(run.config["hyperparameters"]))
+    return agents.make(run.config["agent"], **tuples(run.config["hyperparameters"]))
 
 
 def task_of(run: Run | str | os.PathLike[str]) -> Any:
@@ -89,13 +89,13 @@ def task_of(run: Run | str | os.PathLike[str]) -> Any:
         UserError: there is no such run, or it was trained on a task of your own, which cannot be found by a name.
     """
     run = run if isinstance(run, Run) else Run(run)
-    name, constants = run.config["task"], _tuples(run.config["constants"])
+    name, constants = run.config["task"], tuples(run.config["constants"])
     if not tasks.knows(name):
         raise UserError(f"{run.folder} was trained on {name}, which is not a task of this library: pass task=.")
     return tasks.make(name, run.config.get("observe"), **constants)
 
 
-def _tuples(values: dict[str, Any]) -> dict[str, Any]:
+def tuples(values: dict[str, Any]) -> dict[str, Any]:
     """JSON's lists as the tuples they were."""
     return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
 

@@ -19,7 +19,7 @@ from beliefrl import agents, runs, tasks, trackers
 from beliefrl.agents import Agent
 from beliefrl.analysis.curves import draw_curve
 from beliefrl.checkpoint import Checkpoints, listed
-from beliefrl.evaluation import MODES, agent_of, summary, task_of
+from beliefrl.evaluation import MODES, agent_of, summary, task_of, tuples
 from beliefrl.phases import Seed
 from beliefrl.provenance import provenance
 from beliefrl.rollout import Episode
@@ -108,6 +108,7 @@ def resume(
         if steps is not None and steps < before["steps"]:
             raise UserError(f"steps={steps} is impossible: {folder} trains for {before['steps']}, and may only grow.")
         options = dataclasses.replace(Options(**before), **({} if steps is None else {"steps": steps}))
+        trackers.check(options.track)
         recorder.amend({"options": dataclasses.asdict(options)}, provenance())
     except BaseException:
         recorder.close()
@@ -122,10 +123,7 @@ def _options(run: Run) -> dict[str, Any]:
     for name in run.config["options"]:
         if name not in known:
             raise UserError(f"{run.folder} was trained by another version: this one has no option {name!r}.")
-    known_values = {
-        name: tuple(value) if isinstance(value, list) else value for name, value in run.config["options"].items()
-    }
-    return {"steps": Options.steps} | known_values
+    return {"steps": Options.steps} | tuples(run.config["options"])
 
 
 class _Training:
