@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -68,6 +69,35 @@ def test_a_crashed_training_goes_on_to_the_last_bit(whole, tmp_path, share):
     assert listed(tmp_path / "run")
     resume(tmp_path / "run")
     assert files(tmp_path / "run") == files(folder)
+
+
+LINE = "train sac-mlp pendulum-v --step-start-rl 20 --pretrain-updates 150 --policy-layers 8 --value-layers 8"
+LINE += " --batch-size 8 --steps 240 --seeds 2 --eval-every 120 --eval-episodes 1 --checkpoint-steps 1 --resume --out"
+
+
+@pytest.mark.parametrize("left", ["its log", "an empty log", "no config"])
+def test_a_training_that_was_killed_before_its_first_checkpoint_begins_anew(whole, tmp_path, left):
+    folder = tmp_path / "run"
+    (folder / "metrics").mkdir(parents=True)
+    if left != "no config":
+        (folder / "config.json").write_bytes((whole[0] / "config.json").read_bytes())
+    if left == "its log":
+        (folder / "metrics" / "seed-0.jsonl").write_text('{"step": 20, "kind": "update"}\n')
+    main([*LINE.split(), str(folder)])
+    assert files(folder) == files(whole[0])
+
+
+def test_what_is_no_unfinished_training_is_not_cleared(whole, tmp_path, capsys):
+    finished, other = tmp_path / "finished", tmp_path / "other"
+    shutil.copytree(whole[0], finished, ignore=shutil.ignore_patterns("checkpoints"))
+    (other / "metrics").mkdir(parents=True)
+    (other / "metrics" / "thesis.tex").touch()
+    for folder in (finished, other):
+        before = sorted(folder.rglob("*"))
+        with pytest.raises(SystemExit):
+            main([*LINE.split(), str(folder)])
+        assert "exists already, with nothing to go on from: choose another --out" in capsys.readouterr().err
+        assert sorted(folder.rglob("*")) == before
 
 
 @pytest.mark.slow

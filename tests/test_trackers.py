@@ -126,7 +126,6 @@ def connect(self, address):
     return real(self, address)
 socket.socket.connect = connect
 from beliefrl.runs import Recorder
-from written import a_run, flat
 config = {"agent": "vrm", "hyperparameters": {}, "task": "pendulum", "constants": {}, "started": "2026-01-01T00:00:00"}
 run = Recorder(sys.argv[1], {**config, "options": {"seed": 0, "seeds": 2, "track": ["wandb"]}})
 for seed in (0, 1):

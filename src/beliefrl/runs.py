@@ -14,6 +14,7 @@ import json
 import os
 import pathlib
 import re
+import shutil
 from collections.abc import Collection, Iterator
 from typing import Any
 
@@ -233,6 +234,20 @@ def _make(folder: pathlib.Path, config: dict[str, Any]) -> None:
 
 def _write_config(folder: pathlib.Path, config: dict[str, Any]) -> None:
     write_whole(folder / "config.json", (json.dumps(config, indent=2, default=str) + "\n").encode())
+
+
+def clear(folder: pathlib.Path) -> None:
+    """Remove what a training left that was killed before its first checkpoint, so that it can begin anew.
+
+    Raises:
+        UserError: another process writes it, it holds results, or no training made it.
+    """
+    begun = (folder / "config.json").exists() and not (folder / "results.json").exists()
+    bare = all(path.name in ("metrics", ".config.json.tmp") for path in folder.rglob("*"))
+    if not (begun or bare):
+        raise UserError(f"{folder} exists already, with nothing to go on from: choose another --out.")
+    with locked(folder, "is being trained"):
+        shutil.rmtree(folder)
 
 
 def locked(folder: pathlib.Path, doing: str) -> Any:

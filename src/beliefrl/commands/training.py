@@ -24,10 +24,9 @@ def train(argv: Sequence[str]) -> None:
     """`beliefrl train AGENT TASK ...`."""
     from rich.console import Console
 
-    from beliefrl import agents, tasks
+    from beliefrl import agents, runs, tasks
     from beliefrl.checkpoint import listed
     from beliefrl.display import TrainingDisplay
-    from beliefrl.runs import Run
     from beliefrl.schedule import Options
     from beliefrl.train import train as run_training
 
@@ -79,10 +78,13 @@ def train(argv: Sequence[str]) -> None:
     options = parse(options_type, rest, f"beliefrl train {name}")
     task = tasks.make(options.task, options.observe or None, **named_values(options.constants, "--constants"))
     console = Console()
-    if options.resume and options.out is not None and listed(options.out):
-        _same_training(Run(options.out), name, tasks.describe(task), options)
-        _resume(options.out, options.training.steps)
-        return
+    if options.resume and options.out is not None and options.out.is_dir():
+        if (options.out / "config.json").exists():
+            _same_training(runs.Run(options.out), name, tasks.describe(task), options)
+        if listed(options.out):
+            _resume(options.out, options.training.steps)
+            return
+        runs.clear(options.out)
     with TrainingDisplay(console, options.training.steps) as display:
         run = run_training(options.agent, task, options.out, display, **dataclasses.asdict(options.training))
     _ended(run)
