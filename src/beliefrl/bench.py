@@ -176,15 +176,16 @@ def _update_parts(agent: Agent, timed: _Timed) -> tuple[dict[str, float], float]
     update = mapped(lambda *args: agent.update(*args)[0])
     state, batches = begin(*given)
     batch = jax.tree.map(lambda leaf: leaf[:, 0], batches)
+    updates = jax.tree.leaves(batches)[0].shape[1] / agent.cycle  # of an environment step
 
     s_begin = median_seconds(lambda: begin(*given))
     s_model = median_seconds(lambda: model(*given)) if has_model else 0.0
-    s_update = median_seconds(lambda: update(state, batch, timed.keys)) / agent.train_interval_rl
+    s_update = median_seconds(lambda: update(state, batch, timed.keys)) * updates
     parts = {
         "controller_update": s_update + max(s_begin - s_model, 0.0) / agent.cycle,
         "model_update": s_model / agent.cycle,
     }
-    flop = _flop(begin, *given) / agent.cycle + _flop(update, state, batch, timed.keys) / agent.train_interval_rl
+    flop = _flop(begin, *given) / agent.cycle + _flop(update, state, batch, timed.keys) * updates
     return parts, flop
 
 

@@ -162,11 +162,14 @@ def learn_cycle(agent: Agent, seed: Seed, first: Int[Array, ""]) -> tuple[Any, M
     windows = ring.sample(seed.replay, step_key(seed.key, first, SAMPLE), agent.cycle_windows, agent.window)
     state, batches, model_metrics = agent.begin_cycle(seed.state, windows, step_key(seed.key, first, CYCLE))
 
+    count = len(jax.tree.leaves(batches)[0])
+    begun = first * -(-count // agent.cycle)  # no two updates share a key
+
     def update(state, inputs):
         number, batch = inputs
-        return agent.update(state, batch, step_key(seed.key, first + number, UPDATE))
+        return agent.update(state, batch, step_key(seed.key, begun + number, UPDATE))
 
-    updates = jnp.arange(agent.cycle // agent.train_interval_rl)
+    updates = jnp.arange(count)
     state, metrics = jax.lax.scan(update, state, (updates, batches))
     return state, model_metrics | jax.tree.map(jnp.mean, metrics)
 

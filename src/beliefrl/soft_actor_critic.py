@@ -12,7 +12,7 @@ log α in place of α in J_α, which is the same descent at another speed. A tim
 the differentiated argument comes first, and means are over valid transitions.
 """
 
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -75,12 +75,13 @@ class Batch(NamedTuple):
     """Transitions for one update."""
 
     belief: Float[Array, "batch belief"]  # s_t
-    next_belief: Float[Array, "batch belief"]  # s_{t+1}
+    next_belief: Float[Array, "batch belief"]  # s_{t+1}; s_{t+m} with returns of m steps (`returns`)
     action: Float[Array, "batch action"]  # a_t
-    reward: Float[Array, " batch"]  # r_t
-    terminated: Bool[Array, " batch"]  # s_{t+1} is terminal
+    reward: Float[Array, " batch"]  # r_t, or the discounted sum of m of them
+    terminated: Bool[Array, " batch"]  # `next_belief` is terminal
     valid: Bool[Array, " batch"]  # what is not counts nowhere
     seen: Float[Array, "batch seen"] | None = None  # what the actor reads where that is not s_t (SLAC)
+    discount: Float[Array, " batch"] | None = None  # γ^m of what lies beyond; None: γ
 
 
 def init_controller(
@@ -90,16 +91,22 @@ def init_controller(
     value_layers: tuple[int, ...],
     key: Key[Array, ""],
     seen: int | None = None,
+    value_start: float = 0.0,
 ) -> Controller:
     """A new controller for beliefs and actions of these sizes; V̄ starts as V, log α at 0.
 
-    `seen` is the size of what the actor reads, where that is not the belief.
+    `seen` is the size of what the actor reads, where that is not the belief; `value_start` is added to V and Q.
     """
     actor = Actor(belief if seen is None else seen, action, policy_layers)
     critic = MLP((belief + action, *value_layers, 1), jax.nn.relu)
     value = MLP((belief, *value_layers, 1), jax.nn.relu)
     controller = draw(key, Controller(actor, (critic, critic), value, value, jnp.zeros(())))
+    controller = eqx.tree_at(_last_biases, controller, replace_fn=lambda bias: bias + value_start)
     return controller._replace(target_value=jax.tree.map(jnp.copy, controller.value))
+
+
+def _last_biases(controller: Controller) -> list[Any]:
+    return [network.layers[-1].bias for network in (*controller.critics, controller.value)]
 
 
 def valid_mean(x: Float[Array, " batch"], valid: Bool[Array, " batch"]) -> Float[Array, ""]:
@@ -116,8 +123,9 @@ def value_loss(
 
 def q_loss(critics: tuple[MLP, MLP], target_value: MLP, batch: Batch, gamma: float) -> Float[Array, ""]:
     """J_Q of both critics, summed."""
+    discount = gamma if batch.discount is None else batch.discount
     beyond = jnp.where(batch.terminated, 0.0, state_value(target_value, batch.next_belief))
-    target = jax.lax.stop_gradient(batch.reward + gamma * beyond)
+    target = jax.lax.stop_gradient(batch.reward + discount * beyond)
     errors = [q_value(critic, batch.belief, batch.action) - target for critic in critics]
     return valid_mean(0.5 * errors[0] ** 2 + 0.5 * errors[1] ** 2, batch.valid)
 

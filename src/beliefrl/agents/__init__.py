@@ -21,14 +21,12 @@ class Agent(Protocol):
     """A frozen dataclass of hyperparameters whose methods are pure functions.
 
     A training explores for `step_start_rl` steps with the untrained policy, calls `pretrain` `pretrain_updates` times,
-    and then goes in cycles of `cycle` steps: when these are done, `begin_cycle` once, then an `update` for every
-    `train_interval_rl` of them.
+    and then goes in cycles of `cycle` steps: when these are done, `begin_cycle` once, then an `update` for each batch
+    that it gave.
     """
 
     @property
     def step_start_rl(self) -> int: ...
-    @property
-    def train_interval_rl(self) -> int: ...
     @property
     def pretrain_updates(self) -> int: ...
     @property

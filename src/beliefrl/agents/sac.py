@@ -21,6 +21,7 @@ from beliefrl.soft_actor_critic import (
 )
 from beliefrl.types import LARGEST, check_range
 
+MOST_STEPS = 64  # of a return; each is compiled
 Metrics = dict[str, Float[Array, ""]]
 
 
@@ -34,6 +35,12 @@ class SAC:
     """Environment steps before training starts; the untrained policy acts until then (Table 1)."""
     train_interval_rl: int = 1
     """Environment steps between two updates of the controller (Table 1)."""
+    updates_per_step: int = 1
+    """Updates of the controller at each of these steps (Table 1: one). More learn in fewer steps, and take longer."""
+    n_step: int = 1
+    """Steps of the returns that the critics learn from (the paper: one). More speed up values over a long horizon."""
+    value_start: float = 0.0
+    """What V and Q say of everything before they learn, up to noise (the paper: 0), in units of the return."""
     lr_actor: float = 3e-4
     """Adam's learning rate for the actor (Table 1)."""
     lr_critic: float = 3e-4
@@ -53,12 +60,24 @@ class SAC:
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
-        check_range(self, ("train_interval_rl", "policy_layers", "value_layers"), 1)
+        check_range(self, ("train_interval_rl", "updates_per_step", "policy_layers", "value_layers"), 1)
+        check_range(self, ("n_step",), 1, MOST_STEPS)
+        check_range(self, ("value_start",), -LARGEST)
         check_range(self, ("actor_regulariser",), 0)
         check_range(self, ("step_start_rl",), 2)  # fewer moments hold no transition to learn from
         check_range(self, ("lr_actor", "lr_critic", "lr_alpha", "gamma", "tau"), 0, 1)
         if self.target_entropy is not None:
             check_range(self, ("target_entropy",), -LARGEST)
+
+    @property
+    def cycle_updates(self) -> int:
+        """Updates of the controller in a cycle."""
+        return self.cycle // self.train_interval_rl * self.updates_per_step
+
+    @property
+    def cycle(self) -> int:
+        """Environment steps between two visits to the replay."""
+        return self.train_interval_rl
 
     @property
     def optimisers(self) -> Optimisers:
@@ -68,7 +87,8 @@ class SAC:
         self, key: Key[Array, ""], belief: int, action: int, seen: int | None = None
     ) -> tuple[Controller, OptimiserState]:
         """A new controller and its optimisers; `seen` is what the actor reads, where that is not the belief."""
-        controller = init_controller(belief, action, self.policy_layers, self.value_layers, key, seen)
+        sizes = belief, action, self.policy_layers, self.value_layers
+        controller = init_controller(*sizes, key, seen, self.value_start)
         return controller, init_optimisers(self.optimisers, controller)
 
     def choose(

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents.sac import SAC, Metrics, split_updates
 from beliefrl.nets import LSTM, LSTMState, descend, draw
+from beliefrl.returns import transition_batch
 from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState, soft_update, update
 from beliefrl.types import Spec, Step, Window, WindowShape, check_range, time_major, transitions
 
@@ -63,10 +64,6 @@ class SACLSTMAgent(SAC):
     # How it is trained
 
     @property
-    def cycle(self) -> int:
-        return self.train_interval_rl
-
-    @property
     def window(self) -> WindowShape:
         return WindowShape(self.burn_in, self.seq_len)
 
@@ -76,7 +73,7 @@ class SACLSTMAgent(SAC):
 
     @property
     def cycle_windows(self) -> int:
-        return self.batch_size
+        return self.batch_size * self.cycle_updates
 
     @property
     def lstm_optimiser(self) -> optax.GradientTransformation:
@@ -121,8 +118,8 @@ class SACLSTMAgent(SAC):
         return self.update(state, windows, key)
 
     def begin_cycle(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Window, Metrics]:
-        """A cycle has one update: its windows."""
-        return state, jax.tree.map(lambda leaf: leaf[None], windows), {}
+        """The windows of each update."""
+        return state, jax.tree.map(lambda leaf: leaf.reshape(-1, self.batch_size, *leaf.shape[1:]), windows), {}
 
     def beliefs(self, lstm: LSTM, windows: Window) -> Float[Array, "time batch d"]:
         """d_t from the end of the burn-in on; no gradient goes into the burn-in."""
@@ -143,15 +140,8 @@ class SACLSTMAgent(SAC):
     ) -> Batch:
         """The windows' transitions, with beliefs for the critics, for the actor (the same numbers) and for V̄."""
         step = time_major(windows, self.burn_in, None).step
-        batch = Batch(
-            belief=d[:-1],
-            next_belief=d_target[1:],
-            action=step.prev_action[1:],
-            reward=step.reward[1:],
-            terminated=step.terminated[1:],
-            valid=transitions(windows, self.burn_in).T,
-            seen=d_actor[:-1],
-        )
+        valid = transitions(windows, self.burn_in).T
+        batch = transition_batch(step, valid, d, d_target, self.n_step, self.gamma, d_actor)
         return jax.tree.map(lambda leaf: leaf[0], split_updates(batch, self.batch_size))
 
     def gradients(

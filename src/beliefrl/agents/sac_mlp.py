@@ -11,8 +11,9 @@ import jax
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents.sac import SAC, Metrics
+from beliefrl.returns import transition_batch
 from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState
-from beliefrl.types import Spec, Step, Window, WindowShape, check_range, transitions
+from beliefrl.types import Spec, Step, Window, WindowShape, check_range, time_major, transitions
 
 
 class State(NamedTuple):
@@ -38,13 +39,9 @@ class SACMLPAgent(SAC):
         check_range(self, ("pretrain_updates",), 0)
 
     @property
-    def cycle(self) -> int:
-        return self.train_interval_rl
-
-    @property
     def window(self) -> WindowShape:
-        """One transition; where an episode ends between its two moments, it counts nowhere."""
-        return WindowShape(burn_in=0, length=1)
+        """One transition and what follows it; where an episode ends between its two moments, it counts nowhere."""
+        return WindowShape(burn_in=0, length=self.n_step)
 
     @property
     def pretrain_windows(self) -> int:
@@ -52,7 +49,7 @@ class SACMLPAgent(SAC):
 
     @property
     def cycle_windows(self) -> int:
-        return self.batch_size
+        return self.batch_size * self.cycle_updates
 
     def init(self, key: Key[Array, ""], spec: Spec) -> State:
         return State(*self.init_controller(key, spec.obs_dim, spec.action_dim))
@@ -72,20 +69,15 @@ class SACMLPAgent(SAC):
         return self.update(state, self.batch(windows), key)
 
     def begin_cycle(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Batch, Metrics]:
-        """A cycle has one update: its batch."""
-        return state, jax.tree.map(lambda leaf: leaf[None], self.batch(windows)), {}
+        """The batch of each update."""
+        batch = self.batch(windows)
+        return state, jax.tree.map(lambda leaf: leaf.reshape(-1, self.batch_size, *leaf.shape[1:]), batch), {}
 
     def batch(self, windows: Window) -> Batch:
-        """The windows' transitions."""
-        step = windows.step
-        return Batch(
-            belief=step.obs[:, 0],
-            next_belief=step.obs[:, 1],
-            action=step.prev_action[:, 1],
-            reward=step.reward[:, 1],
-            terminated=step.terminated[:, 1],
-            valid=transitions(windows, 0)[:, 0],
-        )
+        """The windows' first transitions."""
+        step, valid = time_major(windows, 0, None).step, transitions(windows, 0).T
+        batch = transition_batch(step, valid, step.obs, step.obs, self.n_step, self.gamma)
+        return jax.tree.map(lambda leaf: leaf[0], batch)
 
     def update(self, state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
         controller, optimiser, metrics = self.learn_controller(state.controller, state.controller_optimiser, batch, key)

@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Key
 from beliefrl.agents.sac import SAC, Metrics, split_updates
 from beliefrl.latent_model import LatentModel, Latents, elbo_terms, predict
 from beliefrl.nets import Gaussian, descend, draw
+from beliefrl.returns import transition_batch
 from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean
 from beliefrl.types import (
     Spec,
@@ -101,7 +102,7 @@ class SLACAgent(SAC):
     @property
     def cycle_windows(self) -> int:
         """One batch for the model and one for each update of the controller."""
-        return self.batch_size * (1 + self.cycle // self.train_interval_rl)
+        return self.batch_size * (1 + self.cycle_updates)
 
     @property
     def model_optimiser(self) -> optax.GradientTransformation:
@@ -187,16 +188,9 @@ class SLACAgent(SAC):
         step, burn_in, context = time_major(windows, 0, None).step, self.window.burn_in, self.history // 2
         inferred = begin_windows(time_major(windows, burn_in - context, None))
         belief = self.infer(model, inferred, key).z2[context:]
-        after = slice(burn_in + 1, None)
-        batch = Batch(
-            belief=belief[:-1],
-            next_belief=belief[1:],
-            action=step.prev_action[after],
-            reward=step.reward[after],
-            terminated=step.terminated[after],
-            valid=transitions(windows, burn_in).T,
-            seen=self.histories(step)[:-1],
-        )
+        seen, valid = self.histories(step), transitions(windows, burn_in).T
+        after = time_major(windows, burn_in, None).step
+        batch = transition_batch(after, valid, belief, belief, self.n_step, self.gamma, seen)
         return split_updates(batch, self.batch_size)
 
     def histories(self, step: Step) -> Float[Array, "length batch seen"]:

@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents.sac import SAC, Metrics, split_updates
 from beliefrl.nets import Gaussian, LSTMState, descend, draw
+from beliefrl.returns import transition_batch
 from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean
 from beliefrl.types import (
     Spec,
@@ -144,7 +145,7 @@ class VRMAgent(SAC):
     @property
     def cycle_windows(self) -> int:
         """One batch for the model that keeps learning and one for each update of the controller."""
-        return self.batch_size * (self.has_keep + self.cycle // self.train_interval_rl)
+        return self.batch_size * (self.has_keep + self.cycle_updates)
 
     @property
     def model_optimiser(self) -> optax.GradientTransformation:
@@ -283,16 +284,9 @@ class VRMAgent(SAC):
             stored = self.store_first_impression
             parts.insert(0, moments.note[0] if stored else self.unroll(state.first, moments, key_first).d)
         belief = jnp.concatenate(parts, axis=-1)
-        now, after = slice(self.burn_in, -1), slice(self.burn_in + 1, None)
-        batch = Batch(
-            belief=belief[now],
-            next_belief=belief[after],
-            action=moments.step.prev_action[after],
-            reward=moments.step.reward[after],
-            terminated=moments.step.terminated[after],
-            valid=transitions(windows, self.burn_in).T,
-        )
-        return split_updates(batch, self.batch_size)
+        belief, step = belief[self.burn_in :], time_major(windows, self.burn_in, None).step
+        valid = transitions(windows, self.burn_in).T
+        return split_updates(transition_batch(step, valid, belief, belief, self.n_step, self.gamma), self.batch_size)
 
     def update(self, state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
         controller, optimiser, metrics = self.learn_controller(state.controller, state.controller_optimiser, batch, key)
