@@ -96,6 +96,9 @@ class VRMAgent(SAC):
     """Mean (the authors' code; lr_model was tuned on it) or sum (the formula) over the dimensions of z and x."""
     decode_from: Literal["posterior", "prior"] = "posterior"
     """What z is drawn from to decode x in training: the posterior (a true ELBO) or the prior (the authors' code)."""
+    windows: Literal["stream", "episode"] = "stream"
+    """Sequences drawn from the stream of all moments, in which episodes follow each other; or from one episode each,
+    which they overhang at both ends (the authors' code)."""
     store_first_impression: bool = True
     """Keep the first-impression model's d in the replay instead of computing it again for every update."""
 
@@ -108,6 +111,7 @@ class VRMAgent(SAC):
         check_choice(self, "models", ("both", "single", "first", "keep"))
         check_choice(self, "elbo_scaling", ("mean", "sum"))
         check_choice(self, "decode_from", ("posterior", "prior"))
+        check_choice(self, "windows", ("stream", "episode"))
         if self.train_interval_klvrm % self.train_interval_rl:
             raise UserError(
                 f"train_interval_klvrm={self.train_interval_klvrm} is not a multiple of "
@@ -136,7 +140,7 @@ class VRMAgent(SAC):
 
     @property
     def window(self) -> WindowShape:
-        return WindowShape(self.burn_in, self.seq_len)
+        return WindowShape(self.burn_in, self.seq_len, self.windows == "episode")
 
     @property
     def pretrain_windows(self) -> int:
