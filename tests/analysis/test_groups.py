@@ -39,6 +39,18 @@ def test_agents_tasks_and_settings_are_apart_and_named_by_what_differs(tmp_path)
     ]
 
 
+def test_a_run_older_than_a_setting_has_its_default_and_defaults_are_not_named(tmp_path):
+    made = [
+        a_run(tmp_path / "old", [flat(1.0)], settings={"gamma": 0.99}),
+        a_run(tmp_path / "new", [flat(1.0)], settings={"gamma": 0.99, "n_step": 1}, first=1),
+        a_run(tmp_path / "other", [flat(1.0)], settings={"gamma": 0.99, "n_step": 5}),
+    ]
+    assert labels(groups(made, {"vrm": {"gamma": 0.99, "n_step": 1}})) == [
+        ("pendulum-v", "vrm", [0, 1]),
+        ("pendulum-v", "vrm n_step=5", [0]),
+    ]
+
+
 def test_constants_of_a_task_set_it_apart_from_the_same_task_only(tmp_path):
     made = [
         a_run(tmp_path / "a", [flat(1.0)], constants={"length": 1.0}),

@@ -5,7 +5,8 @@ import pytest
 from safetensors.numpy import save_file
 
 from beliefrl.analysis.groups import groups
-from beliefrl.analysis.scalability import STEPS, costs, latex, markdown, wall_clock, write_table
+from beliefrl.analysis.scalability import COLUMNS, STEPS, cells, costs, wall_clock, write_costs
+from beliefrl.analysis.tables import latex, markdown
 from written import a_run, flat
 
 SESSIONS = {
@@ -38,17 +39,17 @@ def test_costs_are_of_one_seed(run):
 
 
 def test_the_table_is_markdown_and_latex(run, tmp_path):
-    table = costs(groups([run]))
-    assert markdown(table).splitlines()[-1] == "| sac_mlp | pendulum-v | 69.44 h | 0.00 M | 20 |"
-    assert r"sac\_mlp & pendulum-v & 69.44 h & 0.00 M & 20 \\" in latex(table)
-    assert write_table(groups([run]), tmp_path / "table").read_text() == markdown(table)
-    assert (tmp_path / "table.tex").read_text() == latex(table)
+    table = COLUMNS, [cells(cost) for cost in costs(groups([run]))]
+    assert markdown(*table).splitlines()[-1] == "| sac_mlp | pendulum-v | 69.44 h | 0.00 M | 20 |"
+    assert r"sac\_mlp & pendulum-v & 69.44 h & 0.00 M & 20 \\" in latex(*table)
+    assert write_costs(groups([run]), tmp_path / "table").read_text() == markdown(*table)
+    assert (tmp_path / "table.tex").read_text() == latex(*table)
 
 
 def test_what_is_not_known_is_said_to_be_unknown(tmp_path):
     (cost,) = costs(groups([a_run(tmp_path / "a", [flat(1.0)])]))
     assert (cost.seconds, cost.parameters) == (None, None)
-    assert "| unknown | unknown |" in markdown([cost])
+    assert "| unknown | unknown |" in markdown(COLUMNS, [cells(cost)])
 
 
 def test_sessions_that_are_no_sessions_have_no_time(tmp_path):

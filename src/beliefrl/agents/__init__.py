@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import json
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from jaxtyping import Array, Bool, Float, Key
@@ -122,6 +123,11 @@ AGENTS: dict[str, Entry] = {
 def names() -> dict[str, str]:
     """Every agent's name with a sentence on it."""
     return {name: entry.about for name, entry in AGENTS.items()}
+
+
+def defaults() -> dict[str, dict[str, Any]]:
+    """Every agent's hyperparameters as its name stands for them, as JSON has them."""
+    return {name: json.loads(json.dumps(dataclasses.asdict(entry.agent))) for name, entry in AGENTS.items()}
 
 
 def find(name: str) -> Any:

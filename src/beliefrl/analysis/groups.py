@@ -2,9 +2,9 @@
 
 import os
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -90,18 +90,23 @@ def _diverged(run: Run, seed: int) -> bool:
     return any(run.rows(seed, "diverged"))
 
 
-def groups(runs: Sequence[Run]) -> list[Group]:
+def groups(runs: Sequence[Run], defaults: Mapping[str, Row] | None = None) -> list[Group]:
     """The runs' seeds put together, in the order in which tasks and agents first come.
+
+    `defaults` are the settings of agents by name (`agents.defaults`): a run that lacks some, as it is older than they
+    are, has those; and what is as usual is not in a label.
 
     Of a seed that was run twice with the same settings only the run that went furthest counts, and of those the latest:
     a seed's number decides everything, so it would count as two what is one.
     """
     seeds: dict[tuple[str, str], dict[int, Run]] = {}
     for run in runs:
-        same_agent = [other.config["hyperparameters"] for other in runs if other.config["agent"] == run.config["agent"]]
+        usual = (defaults or {}).get(run.config["agent"], {})
+        settings = {other.folder: usual | other.config["hyperparameters"] for other in runs}
+        same_agent = [settings[other.folder] for other in runs if other.config["agent"] == run.config["agent"]]
         same_task = [other.config["constants"] for other in runs if task_of(other) == task_of(run)]
         task = " ".join([task_of(run), *_differences(run.config["constants"], same_task)])
-        label = " ".join([run.config["agent"], *_differences(run.config["hyperparameters"], same_agent)])
+        label = " ".join([run.config["agent"], *_differences(settings[run.folder], same_agent, usual)])
         of = seeds.setdefault((task, label), {})
         for seed in run.seeds:
             if seed not in of or _precedence(run, seed) > _precedence(of[seed], seed):
@@ -121,6 +126,10 @@ def task_of(run: Run) -> str:
     return run.config["task"] + (f" observe {' '.join(map(str, seen))}" if seen else "")
 
 
-def _differences(settings: dict[str, Any], beside: Sequence[dict[str, Any]]) -> list[str]:
-    """NAME=VALUE of what is not the same everywhere."""
-    return [f"{name}={value}" for name, value in settings.items() if any(other.get(name) != value for other in beside)]
+def _differences(settings: Row, beside: Sequence[Row], usual: Row | None = None) -> list[str]:
+    """NAME=VALUE of what is not the same everywhere, nor as usual."""
+    return [
+        f"{name}={value}"
+        for name, value in settings.items()
+        if any(other.get(name) != value for other in beside) and (not usual or usual.get(name) != value)
+    ]

@@ -10,9 +10,8 @@ import numpy as np
 
 from beliefrl import arrays
 from beliefrl.analysis.groups import Group, last_step
-from beliefrl.arrays import write_whole
+from beliefrl.analysis.tables import Column, write_table
 from beliefrl.runs import Run
-from beliefrl.types import UserError
 
 STEPS = 100_000  # of the paper's table
 
@@ -59,45 +58,31 @@ def costs(groups: Sequence[Group]) -> list[Cost]:
     return made
 
 
-HEADINGS = ("agent", "task", f"wall-clock time ({STEPS:,} steps)", "parameters", "steps timed")
+COLUMNS = (
+    Column("agent"),
+    Column("task"),
+    Column(f"wall-clock time ({STEPS:,} steps)", True),
+    Column("parameters", True),
+    Column("steps timed", True),
+)
 
 
-def _cells(cost: Cost) -> tuple[str, ...]:
-    hours = "unknown" if cost.seconds is None else _hours(cost.seconds)
+def cells(cost: Cost) -> tuple[str, ...]:
+    """A row of the table."""
+    time = "unknown" if cost.seconds is None else hours(cost.seconds)
     size = "unknown" if cost.parameters is None else f"{cost.parameters / 1e6:.2f} M"
-    return (cost.label, cost.task, hours, size, f"{cost.steps:,}")
+    return (cost.label, cost.task, time, size, f"{cost.steps:,}")
 
 
-def _hours(seconds: float) -> str:
+def hours(seconds: float) -> str:
+    """A time in words."""
     return f"{seconds / 3600:.2f} h" if seconds >= 600 else f"{math.ceil(seconds / 6) / 10:.1f} min"
 
 
-def markdown(table: Sequence[Cost]) -> str:
-    """The table in Markdown."""
-    lines = [HEADINGS, ("---", "---", "---:", "---:", "---:"), *map(_cells, table)]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
-
-
-def latex(table: Sequence[Cost]) -> str:
-    """The table in LaTeX, for the package booktabs."""
-
-    def row(cells: Sequence[str]) -> str:
-        return "    " + " & ".join(cell.replace("_", r"\_").replace("%", r"\%") for cell in cells) + r" \\"
-
-    head = [r"\begin{tabular}{llrrr}", r"    \toprule", row(HEADINGS), r"    \midrule"]
-    return "\n".join([*head, *(row(_cells(cost)) for cost in table), r"    \bottomrule", r"\end{tabular}"]) + "\n"
-
-
-def write_table(groups: Sequence[Group], out: pathlib.Path) -> pathlib.Path:
+def write_costs(groups: Sequence[Group], out: pathlib.Path) -> pathlib.Path:
     """Write the table as .md and .tex; returns the path of the first.
 
     Raises:
         UserError: the files cannot be written.
     """
-    table = costs(groups)
-    try:
-        write_whole(out.with_suffix(".tex"), latex(table).encode())
-        write_whole(out.with_suffix(".md"), markdown(table).encode())
-    except OSError as error:
-        raise UserError(f"{out} cannot be written ({error.strerror}): choose another --out.") from None
-    return out.with_suffix(".md")
+    return write_table(COLUMNS, [cells(cost) for cost in costs(groups)], out)

@@ -9,7 +9,8 @@ import tyro
 
 from beliefrl.arguments import UsageError, parse
 
-KINDS = ("curves", "ablation", "sensitivity", "elbo", "aggregate", "scalability")
+KINDS = ("curves", "ablation", "sensitivity", "elbo", "aggregate", "scalability", "table")
+TABLES = ("scalability", "table")
 HELP = """usage: beliefrl figure KIND RUNS ... [--out FILE]
 
   curves        learning curves: mean and S.E.M. over seeds, a line an agent, a panel a task (Section 5)
@@ -18,6 +19,7 @@ HELP = """usage: beliefrl figure KIND RUNS ... [--out FILE]
   elbo          return beside the negative ELBO of the keep-learning model (Section 5.4)
   aggregate     interquartile means and performance profiles over tasks, with bootstrap intervals
   scalability   wall-clock time and parameters, as Markdown and LaTeX (Appendix G)
+  table         returns at the end, when a task was solved, wall-clock time: as Markdown and LaTeX
 
 RUNS are runs, or folders that hold runs, such as a sweep's. `beliefrl figure KIND --help` shows the options.
 """
@@ -30,7 +32,7 @@ class FigureOptions:
     runs: Annotated[tyro.conf.Positional[tuple[pathlib.Path, ...]], tyro.conf.arg(metavar="RUNS")]
     """Runs, or folders that hold runs, such as a sweep's."""
     out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """The file, without an ending or with .png or .pdf (scalability: .md or .tex). None: KIND in this folder."""
+    """The file, without an ending or with .png or .pdf (scalability, table: .md or .tex). None: KIND in this folder."""
     actions: Literal["sampled", "mode"] = "sampled"
     """Returns with sampled actions (the paper) or with the policy's mode."""
     tasks: tuple[str, ...] = ()
@@ -54,11 +56,11 @@ def figure(argv: Sequence[str]) -> None:
     groups, left_out = _groups(options, kind)
     out = options.out or pathlib.Path(kind)
 
-    from beliefrl.analysis import aggregate, elbo, panels, scalability
+    from beliefrl.analysis import aggregate, elbo, final, panels, scalability
     from beliefrl.sweeps import presets
 
-    if kind == "scalability":
-        path = scalability.write_table(groups, out)
+    if kind in TABLES:
+        path = (scalability.write_costs if kind == "scalability" else final.write_final)(groups, out)
         print(path.read_text(), end="")
     elif kind == "elbo":
         path = elbo.draw_elbo(groups, out, options.actions)
@@ -70,11 +72,12 @@ def figure(argv: Sequence[str]) -> None:
         path = panels.draw_curves(groups, out, options.actions)
     for folder in left_out:
         print(f"left out: {folder} is not finished (--unfinished draws it as far as it has come)")
-    print(f"written to {path} and {path.with_suffix('.tex' if kind == 'scalability' else '.pdf').name}")
+    print(f"written to {path} and {path.with_suffix('.tex' if kind in TABLES else '.pdf').name}")
 
 
 def _groups(options: FigureOptions, kind: str) -> tuple[list, list[pathlib.Path]]:
     """The chosen runs' lines, and the folders of those that were left out."""
+    from beliefrl import agents
     from beliefrl.analysis import groups
     from beliefrl.types import UserError
 
@@ -88,4 +91,4 @@ def _groups(options: FigureOptions, kind: str) -> tuple[list, list[pathlib.Path]
     drawn = [run for run in chosen if options.unfinished or groups.is_finished(run)]
     if not drawn:
         raise UserError(f"None of the {len(found)} runs can be drawn: none that was asked for is finished.")
-    return groups.groups(drawn), [run.folder for run in chosen if run not in drawn]
+    return groups.groups(drawn, agents.defaults()), [run.folder for run in chosen if run not in drawn]

@@ -1,6 +1,5 @@
 """What a report tells of runs, as plain values that are written as JSON: what is not a finite number becomes None."""
 
-import dataclasses
 import json
 import os
 import pathlib
@@ -18,7 +17,6 @@ from beliefrl.analysis.palette import colours
 from beliefrl.analysis.scalability import wall_clock
 from beliefrl.evaluation import MODES
 from beliefrl.runs import Row, Run
-from beliefrl.types import UserError
 
 MEDIA = (".mp4", ".webm", ".gif")
 PICTURE = "curve.png"
@@ -49,7 +47,7 @@ def told(runs: Sequence[Run], beside: pathlib.Path, unfinished: bool = False) ->
     evaluation, and the curve of a group then ends where its shortest seed does.
     """
     counted = [run for run in runs if is_finished(run) or (unfinished and _has_begun(run))]
-    lines = [group for group in groups(counted) if group.curve().steps.size]
+    lines = [group for group in groups(counted, agents.defaults()) if group.curve().steps.size]
     of = {(run.folder, seed): index for index, group in enumerate(lines) for run, seed in group.seeds}
     palette = colours([group.label for group in lines])
     agent_of = {group.label: group.agent for group in lines}
@@ -150,9 +148,8 @@ def _run(run: Run, beside: pathlib.Path, groups_of: dict[int, int | None]) -> di
 
 def settings(config: dict[str, Any]) -> list[str] | None:
     """NAME=VALUE of the hyperparameters that are not the agent's own; None where this version has no such agent."""
-    try:
-        own = json.loads(json.dumps(dataclasses.asdict(agents.find(config["agent"]))))
-    except UserError:
+    own = agents.defaults().get(config["agent"])
+    if own is None:
         return None
     missing = object()
     given = config["hyperparameters"]

@@ -1,0 +1,80 @@
+"""The table of what agents reach: final returns with their spread, when a task was solved, and how long that took."""
+
+import pathlib
+from collections.abc import Sequence
+
+import numpy as np
+
+from beliefrl.analysis.aggregate import bounds
+from beliefrl.analysis.curves import standard_error
+from beliefrl.analysis.groups import Curve, Group
+from beliefrl.analysis.panels import counts
+from beliefrl.analysis.scalability import hours, wall_clock
+from beliefrl.analysis.tables import Column, write_table
+
+SOLVED = 0.95  # score, as in `aggregate`: over -203 on the pendulum, 951 on CartPole, 133 in target reaching
+
+COLUMNS = (
+    Column("task"),
+    Column("agent"),
+    Column("seeds"),
+    Column("steps", True),
+    Column("sampled actions", True),
+    Column("mode actions", True),
+    Column("solved at", True),
+    Column("wall-clock a seed", True),
+)
+
+
+def rows(groups: Sequence[Group]) -> list[tuple[str, ...]]:
+    """A row for each agent on each task: returns at the last evaluation, mean ± S.E.M. over seeds.
+
+    It is solved at the first evaluation at which the mean over seeds, with sampled or with mode actions, scores 0.95.
+    """
+    made = []
+    for group in groups:
+        sampled, mode = group.curve("sampled"), group.curve("mode")
+        if not sampled.steps.size:
+            continue
+        spans = [wall_clock(run) for run in group.runs]
+        known = [span for span in spans if span is not None]
+        seconds = sum(known) / sum(len(run.seeds) for run in group.runs) if len(known) == len(spans) else None
+        success = ("sampled_success", "mode_success") if group.has_success else ("", "")
+        made.append(
+            (
+                f"`{group.task}`",
+                f"`{group.label}`",
+                counts([seed for _, seed in group.seeds]),
+                f"{sampled.steps[-1]:,}",
+                _final(sampled) + _rate(group, success[0]),
+                _final(mode) + _rate(group, success[1]),
+                _solved(group.task, sampled, mode),
+                "unknown" if seconds is None else hours(seconds),
+            )
+        )
+    return made
+
+
+def _final(curve: Curve) -> str:
+    error = f" ± {standard_error(curve.seeds[:, -1:])[0]:.1f}" if len(curve.seeds) > 1 else ""
+    return f"{np.nanmean(curve.seeds[:, -1]):.1f}{error}"
+
+
+def _rate(group: Group, name: str) -> str:
+    return f"; success {np.nanmean(group.curve(name).seeds[:, -1]):.0%}" if name else ""
+
+
+def _solved(task: str, *curves: Curve) -> str:
+    """The step at which the mean of one of these is good enough for the first time."""
+    low, high = bounds(task, {})
+    enough = np.any([np.nanmean(curve.seeds, axis=0) >= low + SOLVED * (high - low) for curve in curves], axis=0)
+    return f"{curves[0].steps[np.argmax(enough)]:,}" if enough.any() else "no"
+
+
+def write_final(groups: Sequence[Group], out: pathlib.Path) -> pathlib.Path:
+    """Write the table as .md and .tex; returns the path of the first.
+
+    Raises:
+        UserError: the files cannot be written.
+    """
+    return write_table(COLUMNS, rows(groups), out)
