@@ -20,9 +20,10 @@ def is_kept(row: dict) -> bool:
 def keep(run: pathlib.Path, to: pathlib.Path) -> None:
     """Copy what stays of one run."""
     (to / "metrics").mkdir(parents=True, exist_ok=True)
-    for name in ("config.json", "results.json"):
-        if (run / name).exists():
-            shutil.copy(run / name, to / name)
+    config = (run / "config.json").read_text()  # where the sweep lay on this machine concerns nobody
+    (to / "config.json").write_text(config.replace(str(run.parent.resolve()), f"runs/{run.parent.name}"))
+    if (run / "results.json").exists():
+        shutil.copy(run / "results.json", to / "results.json")
     for log in (run / "metrics").iterdir():
         lines = [line for line in log.read_text().splitlines(keepends=True) if is_kept(json.loads(line))]
         (to / "metrics" / log.name).write_text("".join(lines))
