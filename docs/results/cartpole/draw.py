@@ -20,6 +20,7 @@ from beliefrl.figures import figure, save
 EPISODES = range(8)
 DASHES = ("-", "--", ":", "-.")
 LIMIT = 2.4  # m, where the track ends
+AHEAD = 200  # steps from where the cart begins to drift to where the track ends
 TILT = np.radians(12.0)  # rad, where the pole counts as fallen
 
 
@@ -66,29 +67,49 @@ def draw_episodes(top, below, run):
     for axis, bound, name in ((top, LIMIT, "cart $x$ (m)"), (below, TILT, "pole θ (rad)")):
         for edge in (-bound, bound):
             axis.axhline(edge, color="black", linewidth=0.8, linestyle="--")
-        axis.set_ylabel(name)
+        axis.set(xlabel="time (s)", ylabel=name)
     steps = max(row["step"] for row in run.rows(run.seeds[0], "evaluation"))
     title = f"{len(EPISODES)} episodes of {run.config['agent']} on {run.config['task']} after {steps:,} steps"
     top.set_title(title, loc="left", fontsize=10)
-    below.set_xlabel("time (s)")
     for length, x, theta in ends:
         print(f"{length:5} steps, then x = {x:5.2f} m, θ = {np.degrees(theta):5.1f}°")
+
+
+def cost_ahead(tau, n, count, gamma=0.99, ahead=AHEAD):
+    """What it costs to leave the track in so many steps, as V̄ has it after 1, 2, ... `count` updates.
+
+    The value of a state that far from the end, below that of one without an end, where V and Q learn at once: each
+    update moves V̄ by τ towards what lies n steps nearer to the end.
+    """
+    distance = np.arange(1, ahead + 1)
+    known, costs = np.zeros(ahead + 1), np.empty(count)
+    known[0] = 1 / (1 - gamma)
+    for update in range(count):
+        beyond = gamma ** np.minimum(distance, n) * known[np.maximum(distance - n, 0)]
+        known[1:] += tau * (beyond - known[1:])
+        costs[update] = known[-1]
+    return costs
+
+
+def draw_costs(axis):
+    """How late the end of the track is noticed, with the paper's settings and others."""
+    for (tau, n), dash in zip(((0.005, 1), (0.02, 1), (0.005, 5), (0.02, 5)), DASHES, strict=True):
+        label = f"τ = {tau}, n = {n}" + (" (the paper)" if (tau, n) == (0.005, 1) else "")
+        axis.plot(cost_ahead(tau, n, 60_000), dash, color="black", linewidth=1.2, label=label)
+    axis.set(xlabel="updates $k$ of the controller", ylabel="value")
+    axis.set_title(f"What leaving the track in {AHEAD} steps costs, as V̄ has it", loc="left", fontsize=10)
+    axis.legend(frameon=False, fontsize=8, loc="center", bbox_to_anchor=(0.4, 0.5))
 
 
 def main():
     """The picture."""
     runs = [beliefrl.Run(path) for path in sys.argv[1:]]
-    made = figure(9.0, 3.6)
-    left, right = made.subplots(1, 2, width_ratios=(1, 1), subplot_kw={"visible": True})
-    place = right.get_subplotspec()
-    right.remove()
-    halves = place.subgridspec(2, 1)
-    top = made.add_subplot(halves[0])
-    below = made.add_subplot(halves[1], sharex=top)
-    draw_values(left, runs)
+    made = figure(9.6, 6.6)
+    values, costs, top, below = made.subplots(2, 2).flat
+    draw_values(values, runs)
+    draw_costs(costs)
     draw_episodes(top, below, runs[0])
-    top.tick_params(labelbottom=False)
-    for axis in (left, top, below):
+    for axis in (values, costs, top, below):
         axis.grid(alpha=0.25)
         axis.spines[["top", "right"]].set_visible(False)
     print(save(made, pathlib.Path(__file__).with_name("horizon")))
