@@ -73,6 +73,29 @@ def test_no_result_depends_on_where_the_training_is_cut(small):
         np.testing.assert_array_equal(ours, theirs)
 
 
+class KeyKeeper(CountingAgent):
+    """Makes more updates than steps, and keeps the key of each."""
+
+    def init(self, key, spec):
+        return super().init(key, spec)._replace(seen=jnp.zeros((120, 2), jnp.uint32))
+
+    def begin_cycle(self, state, windows, key):
+        return state, jnp.arange(10), {}
+
+    def update(self, state, batch, key):
+        return state._replace(seen=jnp.roll(state.seen, 1, axis=0).at[0].set(jax.random.key_data(key))), {}
+
+
+def test_an_update_is_made_for_every_batch_and_no_two_have_one_key():
+    agent = KeyKeeper()
+    seed = phases.begin(agent, Counting(), 100, jax.random.key(0))
+    for first in range(10, 10 + 12 * agent.cycle, agent.cycle):
+        state, _ = phases.learn_cycle(agent, seed, jnp.array(first))
+        seed = seed._replace(state=state)
+    assert len({tuple(key) for key in np.array(seed.state.seen).tolist()}) == 120
+    assert np.array(seed.state.seen).any(axis=1).all()
+
+
 def counting(steps=120, task=None):
     agent = CountingAgent()
     traces = []
