@@ -6,6 +6,7 @@ every thousandth step, so that a run of 80,000 steps takes 100 kB. The commands 
 
 import json
 import pathlib
+import re
 import shutil
 import sys
 
@@ -21,7 +22,7 @@ def keep(run: pathlib.Path, to: pathlib.Path) -> None:
     """Copy what stays of one run."""
     (to / "metrics").mkdir(parents=True, exist_ok=True)
     config = (run / "config.json").read_text()  # where the sweep lay on this machine concerns nobody
-    (to / "config.json").write_text(config.replace(str(run.parent.resolve()), f"runs/{run.parent.name}"))
+    (to / "config.json").write_text(re.sub(r'"/[^"]*/(runs/[^"]*)"', r'"\1"', config))
     if (run / "results.json").exists():
         shutil.copy(run / "results.json", to / "results.json")
     for log in (run / "metrics").iterdir():
