@@ -75,7 +75,9 @@ LINE = "train sac-mlp pendulum-v --step-start-rl 20 --pretrain-updates 150 --pol
 LINE += " --batch-size 8 --steps 240 --seeds 2 --eval-every 120 --eval-episodes 1 --checkpoint-steps 1 --resume --out"
 
 
-@pytest.mark.parametrize("left", ["its log", "an empty log", "no config"])
+@pytest.mark.parametrize(
+    "left", ["its log", *(pytest.param(left, marks=pytest.mark.slow) for left in ("an empty log", "no config"))]
+)
 def test_a_training_that_was_killed_before_its_first_checkpoint_begins_anew(whole, tmp_path, left):
     folder = tmp_path / "run"
     (folder / "metrics").mkdir(parents=True)

@@ -71,7 +71,9 @@ def test_a_truncated_episode_bootstraps_from_its_last_moment_and_a_terminated_on
     np.testing.assert_allclose(batch.reward[:, 0][batch.valid[:, 0]], [1 + GAMMA, 1, 1 + GAMMA, 1])
 
 
-@pytest.mark.parametrize("name", ["vrm", "sac-mlp", "sac-lstm", "slac"])
+@pytest.mark.parametrize(
+    "name", ["sac-mlp", *(pytest.param(name, marks=pytest.mark.slow) for name in ("vrm", "sac-lstm", "slac"))]
+)
 def test_every_agent_learns_from_n_steps_and_as_often_as_it_is_told(name):
     settings = {"policy_layers": (8,), "value_layers": (8,), "batch_size": 2}
     settings |= {
