@@ -27,6 +27,11 @@ def test_a_task_is_solved_by_the_mean_over_seeds(tmp_path, task, enough):
     assert row[6] == "no"
 
 
+def test_of_a_task_without_a_known_good_return_nobody_says_that_it_is_solved(tmp_path):
+    (row,) = rows(groups([a_run(tmp_path / "a", [flat(10, 2000)], task="hopper-v")]))
+    assert row[6] == "-"
+
+
 def test_success_is_told_where_a_task_has_it_and_an_unknown_time_is_unknown(tmp_path):
     seed = [(10, [1.0, 3.0], [True, False])]
     (row,) = rows(groups([a_run(tmp_path / "a", [seed], task="target-reaching")]))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import functools
 import json
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -125,6 +126,7 @@ def names() -> dict[str, str]:
     return {name: entry.about for name, entry in AGENTS.items()}
 
 
+@functools.cache
 def defaults() -> dict[str, dict[str, Any]]:
     """Every agent's hyperparameters as its name stands for them, as JSON has them."""
     return {name: json.loads(json.dumps(dataclasses.asdict(entry.agent))) for name, entry in AGENTS.items()}

@@ -115,6 +115,11 @@ class SAC:
         return controller, state, metrics
 
 
+def for_each_update(windows: Any, count: int) -> Any:
+    """(update · count, ...) to (update, count, ...): a cycle's windows, or what is made of them, for each update."""
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, count, *leaf.shape[1:]), windows)
+
+
 def split_updates(moments: Any, windows: int) -> Any:
     """(time, update · windows, ...) to (update, time · windows, ...): a cycle's moments for each of its updates."""
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents.sac import SAC, Metrics, split_updates
+from beliefrl.agents.sac import SAC, Metrics, for_each_update, split_updates
 from beliefrl.nets import LSTM, LSTMState, descend, draw
 from beliefrl.returns import transition_batch
 from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState, soft_update, update
@@ -119,7 +119,7 @@ class SACLSTMAgent(SAC):
 
     def begin_cycle(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Window, Metrics]:
         """The windows of each update."""
-        return state, jax.tree.map(lambda leaf: leaf.reshape(-1, self.batch_size, *leaf.shape[1:]), windows), {}
+        return state, for_each_update(windows, self.batch_size), {}
 
     def beliefs(self, lstm: LSTM, windows: Window) -> Float[Array, "time batch d"]:
         """d_t from the end of the burn-in on; no gradient goes into the burn-in."""

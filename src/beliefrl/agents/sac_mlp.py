@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents.sac import SAC, Metrics
+from beliefrl.agents.sac import SAC, Metrics, for_each_update
 from beliefrl.returns import transition_batch
 from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState
 from beliefrl.types import Spec, Step, Window, WindowShape, check_range, time_major, transitions
@@ -70,8 +70,7 @@ class SACMLPAgent(SAC):
 
     def begin_cycle(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Batch, Metrics]:
         """The batch of each update."""
-        batch = self.batch(windows)
-        return state, jax.tree.map(lambda leaf: leaf.reshape(-1, self.batch_size, *leaf.shape[1:]), batch), {}
+        return state, for_each_update(self.batch(windows), self.batch_size), {}
 
     def batch(self, windows: Window) -> Batch:
         """The windows' first transitions."""

@@ -71,9 +71,13 @@ def scores(groups: Sequence[Group], mode: str = "sampled") -> dict[str, Scores]:
 
 def bounds(task: str, final: dict[tuple[str, str], np.ndarray]) -> tuple[float, float]:
     """The returns that score 0 and 1."""
-    known = next((both for name, both in BOUNDS.items() if task.startswith(name)), None)
     best = max((float(np.nanmean(values)) for (of, _), values in final.items() if of == task), default=1.0)
-    return known or (0.0, best if best > 0 else 1.0)
+    return known_bounds(task) or (0.0, best if best > 0 else 1.0)
+
+
+def known_bounds(task: str) -> tuple[float, float] | None:
+    """The entry of a task in BOUNDS, whatever is seen of it; None where it has none."""
+    return next((both for name, both in BOUNDS.items() if task.startswith(name)), None)
 
 
 def _normalised(returns: np.ndarray, ends: tuple[float, float]) -> np.ndarray:

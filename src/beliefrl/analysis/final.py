@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from beliefrl.analysis.aggregate import bounds
+from beliefrl.analysis.aggregate import known_bounds
 from beliefrl.analysis.curves import standard_error
 from beliefrl.analysis.groups import Curve, Group
 from beliefrl.analysis.panels import counts
@@ -65,8 +65,11 @@ def _rate(group: Group, name: str) -> str:
 
 
 def _solved(task: str, *curves: Curve) -> str:
-    """The step at which the mean of one of these is good enough for the first time."""
-    low, high = bounds(task, {})
+    """The step at which the mean of one of these is good enough for the first time; - where nobody knows what is."""
+    known = known_bounds(task)
+    if known is None:
+        return "-"
+    low, high = known
     enough = np.any([np.nanmean(curve.seeds, axis=0) >= low + SOLVED * (high - low) for curve in curves], axis=0)
     return f"{curves[0].steps[np.argmax(enough)]:,}" if enough.any() else "no"
 

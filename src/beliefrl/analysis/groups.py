@@ -99,14 +99,16 @@ def groups(runs: Sequence[Run], defaults: Mapping[str, Row] | None = None) -> li
     Of a seed that was run twice with the same settings only the run that went furthest counts, and of those the latest:
     a seed's number decides everything, so it would count as two what is one.
     """
+    usual = {run.config["agent"]: (defaults or {}).get(run.config["agent"], {}) for run in runs}
+    settings = {run.folder: usual[run.config["agent"]] | run.config["hyperparameters"] for run in runs}
     seeds: dict[tuple[str, str], dict[int, Run]] = {}
     for run in runs:
-        usual = (defaults or {}).get(run.config["agent"], {})
-        settings = {other.folder: usual | other.config["hyperparameters"] for other in runs}
         same_agent = [settings[other.folder] for other in runs if other.config["agent"] == run.config["agent"]]
         same_task = [other.config["constants"] for other in runs if task_of(other) == task_of(run)]
         task = " ".join([task_of(run), *_differences(run.config["constants"], same_task)])
-        label = " ".join([run.config["agent"], *_differences(settings[run.folder], same_agent, usual)])
+        label = " ".join(
+            [run.config["agent"], *_differences(settings[run.folder], same_agent, usual[run.config["agent"]])]
+        )
         of = seeds.setdefault((task, label), {})
         for seed in run.seeds:
             if seed not in of or _precedence(run, seed) > _precedence(of[seed], seed):
