@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from beliefrl import agents, evaluate, host_loop, load, phases, train
+from beliefrl import agents, evaluate, host_loop, load, phases, tasks, train
 from beliefrl.lockstep import Lockstep
 from beliefrl.runs import Run
 from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
@@ -107,8 +107,8 @@ def played(lanes, steps=25):
     return seen
 
 
-def test_processes_of_their_own_change_nothing_and_end():
-    task = GymnasiumTask(Fine)
+@pytest.mark.parametrize("task", [GymnasiumTask(Fine), tasks.make("gym:Pendulum-v1")], ids=lambda task: task.name)
+def test_processes_of_their_own_change_nothing_and_end(task):
     alone, apart = Lockstep(task, ["a", "b"], "never"), Lockstep(task, ["a", "b"], "always")
     assert not alone.apart
     assert apart.apart

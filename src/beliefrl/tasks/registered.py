@@ -7,6 +7,7 @@ classic ones are Gymnasium's own.
 
 import contextlib
 import ctypes
+import dataclasses
 import importlib
 import os
 import pathlib
@@ -96,15 +97,6 @@ def make(id: str, arguments: dict[str, Any], name: str | None = None) -> Gymnasi
     if package:
         _import(package, id)
 
-    def make(**arguments: Any) -> gymnasium.Env[Any, Any]:
-        with _quiet() if package else contextlib.nullcontext():
-            if package:
-                importlib.import_module(package)  # in a process of its own it has not been yet
-            environment = gymnasium.make(id.rpartition(":")[2], disable_env_checker=True, **arguments)
-            if package == BULLET:
-                environment.reset()  # only now PyBullet begins, and says so
-        return environment
-
     try:
         gymnasium.spec(id.rpartition(":")[2])
     except error.Error as found:
@@ -115,7 +107,7 @@ def make(id: str, arguments: dict[str, Any], name: str | None = None) -> Gymnasi
     limit = arguments.get("max_episode_steps")
     if limit is not None and not (isinstance(limit, int) and limit >= 1):
         raise UserError(f"max_episode_steps={limit} is impossible: it must be a whole number of at least 1.")
-    return GymnasiumTask(_explained(make, id), name, dict(arguments))
+    return GymnasiumTask(_Registered(id), name, dict(arguments))
 
 
 def _import(package: str, id: str) -> None:
@@ -128,16 +120,24 @@ def _import(package: str, id: str) -> None:
         raise UserError(f"The module {package} cannot be imported: {type(found).__name__}: {found}.") from None
 
 
-def _explained(make: Any, id: str) -> Any:
-    """The same, with a missing package put as a sentence."""
+@dataclasses.dataclass(frozen=True)
+class _Registered:
+    """Makes an environment by its id, in whatever process: a closure might not be sent to another one."""
 
-    def explained(**arguments: Any) -> gymnasium.Env[Any, Any]:
+    id: str
+
+    def __call__(self, **arguments: Any) -> gymnasium.Env[Any, Any]:
+        package, _, name = self.id.rpartition(":")
         try:
-            return make(**arguments)
+            with _quiet() if package else contextlib.nullcontext():
+                if package:
+                    importlib.import_module(package)  # in a process of its own it has not been yet
+                environment = gymnasium.make(name, disable_env_checker=True, **arguments)
+                if package == BULLET:
+                    environment.reset()  # only now PyBullet begins, and says so
         except (ImportError, error.DependencyNotInstalled) as found:
-            raise UserError(_missing(id, found)) from None
-
-    return explained
+            raise UserError(_missing(self.id, found)) from None
+        return environment
 
 
 def _missing(id: str, found: Exception) -> str:
