@@ -1,11 +1,22 @@
 """Every test runs with the shapes in our signatures checked, and with no silent broadcasting between ranks."""
 
 import os
+import shutil
+import tempfile
 
-os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")  # most of a test's time is compilation
+# Most of a test's time is compilation. So little is optimised, and what one test has compiled the next ones read, and
+# the programs that they start; a folder for each of pytest's processes, as JAX does not write its files in one piece.
+os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="beliefrl-compiled-")
+os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
 
 import jax
 import jaxtyping
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jaxtyping.install_import_hook("beliefrl", "beartype.beartype")  # before the first import of beliefrl
+
+
+def pytest_unconfigure():
+    shutil.rmtree(os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)

@@ -43,16 +43,11 @@ def program(*argv):
     return [sys.executable, "-m", "beliefrl.cli", *map(str, argv)]
 
 
-@pytest.fixture(scope="module", autouse=True)
+@pytest.fixture(scope="module")
 def shared(tmp_path_factory):
-    """A folder that all workers of pytest share; in it, programs find what others have compiled."""
+    """A folder that all workers of pytest share."""
     folder = tmp_path_factory.getbasetemp()
-    folder = folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("JAX_COMPILATION_CACHE_DIR", str(folder / "compiled"))
-        patch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-        patch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
-        yield folder
+    return folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
 
 
 def output(*command):

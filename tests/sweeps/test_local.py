@@ -65,7 +65,8 @@ def test_there_is_a_slot_for_each_core_and_no_more_than_asked_for(monkeypatch):
 
 
 def test_a_training_has_one_thread_on_a_core_and_one_gpu_on_a_gpu(tmp_path, monkeypatch):
-    monkeypatch.delenv("NPROC", raising=False)
+    for name in ("NPROC", "JAX_COMPILATION_CACHE_DIR"):
+        monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5")
     assert local.environment(tmp_path, "0")["NPROC"] == "1"
     assert "NPROC" not in local.environment(tmp_path, "-")
