@@ -5,6 +5,7 @@ import pytest
 
 from beliefrl.analysis import elbo, panels
 from beliefrl.analysis.groups import groups
+from beliefrl.analysis.palette import dashes
 from beliefrl.sweeps import presets
 from beliefrl.types import UserError
 from written import a_run, flat
@@ -39,6 +40,21 @@ def test_a_panel_is_a_task_and_a_line_an_agents_mean(two_tasks, drawn, tmp_path)
         np.testing.assert_array_equal(lines["vrm"], [[10, 1.5], [20, 4.5]])
         (band, _) = axis.collections
         assert (band.get_paths()[0].get_extents().y0, band.get_paths()[0].get_extents().y1) == (1.0, 6.0)
+
+
+def test_lines_of_one_agent_differ_in_their_dashes_and_the_plain_one_is_solid():
+    labels = ["mine lr=1", "vrm z_size=8", "vrm", "mine", "vrm z_size=4", "slac"]
+    assert list(dashes(labels).items()) == list(zip(labels, [1, 1, 0, 0, 2, 0], strict=True))
+
+
+def test_the_dashes_of_a_line_are_those_of_its_legend(drawn, tmp_path):
+    runs = [
+        a_run(tmp_path / f"{gamma}", [flat(1.0, 3.0)], agent="vrm", settings={"gamma": gamma}) for gamma in (0.9, 0.99)
+    ]
+    panels.draw_curves(groups(runs), tmp_path / "picture")
+    style = {line.get_label(): line.get_linestyle() for line in drawn[0].axes[0].lines}
+    assert style == {line.get_label(): line.get_linestyle() for line in drawn[0].legends[0].get_lines()}
+    assert len(set(style.values())) == 2
 
 
 def test_both_files_are_written(two_tasks, tmp_path):

@@ -1,5 +1,7 @@
 """One colour for each line of a figure: an agent has the same one in every picture and on every page.
 
+Lines of one agent with different settings differ in their dashes too.
+
 The colours of the agents differ for colour-blind readers too (by Machado et al. 2009), and stand out 3 to 1 from white.
 """
 
@@ -18,6 +20,10 @@ AGENTS = {
 OTHERS = ("#777777", "#8f8f1f", "#3c8fc0", "#b37700", "#5e4fa2", "#0f8b8d")
 
 
+def _has_settings(label: str) -> bool:
+    return " " in label
+
+
 def colours(labels: Sequence[str]) -> dict[str, str]:
     """A colour "#rrggbb" for each label, whose first word is the agent's name.
 
@@ -26,9 +32,20 @@ def colours(labels: Sequence[str]) -> dict[str, str]:
     """
     chosen: dict[str, str] = {}
     others = 0
-    for label in sorted(dict.fromkeys(labels), key=lambda label: label not in AGENTS):  # the plain name goes first
+    for label in sorted(dict.fromkeys(labels), key=_has_settings):  # the plain name goes first
         own = AGENTS.get(label.partition(" ")[0])
         if own is None or own in chosen.values():
             own, others = OTHERS[others % len(OTHERS)], others + 1
         chosen[label] = own
+    return {label: chosen[label] for label in labels}
+
+
+def dashes(labels: Sequence[str]) -> dict[str, int]:
+    """How many lines of its agent come before each label, the agent's plain name first: the number of its dashes."""
+    before: dict[str, int] = {}
+    chosen = {}
+    for label in sorted(dict.fromkeys(labels), key=_has_settings):
+        agent = label.partition(" ")[0]
+        chosen[label] = before.get(agent, 0)
+        before[agent] = chosen[label] + 1
     return {label: chosen[label] for label in labels}

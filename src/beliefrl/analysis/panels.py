@@ -8,12 +8,13 @@ import numpy as np
 
 from beliefrl.analysis.curves import standard_error
 from beliefrl.analysis.groups import Curve, Group
-from beliefrl.analysis.palette import colours
+from beliefrl.analysis.palette import colours, dashes
 from beliefrl.figures import figure, save
 from beliefrl.types import UserError
 
 COLUMNS = 3
 PANEL = (3.5, 2.7)  # inches
+DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (7, 2, 1.5, 2)), (0, (3, 1, 1, 1, 1, 1)))  # in widths of the line
 
 
 def draw_curves(groups: Sequence[Group], out: pathlib.Path, mode: str = "sampled") -> pathlib.Path:
@@ -35,13 +36,15 @@ def draw_curves(groups: Sequence[Group], out: pathlib.Path, mode: str = "sampled
     entries += [(task, "_success") for task in tasks_of([group for group in groups if group.has_success])]
     labels = list(dict.fromkeys(group.label for group in groups))
     colour = colours(labels)
+    style = {label: DASHES[number % len(DASHES)] for label, number in dashes(labels).items()}
     made, axes = panels(len(entries), len(labels))
     for axis, (task, suffix) in zip(axes, entries, strict=True):
         for group in groups:
             if group.task == task and (not suffix or group.has_success):
-                draw_line(axis, group.curve(mode + suffix), colour[group.label], group.label)
+                line = group.curve(mode + suffix), colour[group.label], group.label
+                draw_line(axis, *line, linestyle=style[group.label])
         finish(axis, task, "success rate" if suffix else "return")
-    add_legend(made, {label: colour[label] for label in labels}, spread(groups))
+    add_legend(made, {label: colour[label] for label in labels}, spread(groups), style)
     return save(made, out)
 
 
@@ -107,11 +110,15 @@ def legend_columns(width: float) -> int:
     return max(1, int(width / 2.1))
 
 
-def add_legend(made: Any, colour: dict[str, str], title: str) -> None:
-    """One legend below all panels."""
+def add_legend(made: Any, colour: dict[str, str], title: str, style: dict[str, Any] | None = None) -> None:
+    """One legend below all panels; lines are solid but for those with a style."""
     from matplotlib.lines import Line2D
 
-    lines = [Line2D([], [], color=each, linewidth=2, label=label) for label, each in colour.items()]
+    dash = style or {}
+    lines = [
+        Line2D([], [], color=each, linewidth=2, label=label, linestyle=dash.get(label, "-"))
+        for label, each in colour.items()
+    ]
     columns = legend_columns(made.get_figwidth())
     made.legend(
         handles=lines,

@@ -13,7 +13,7 @@ import numpy as np
 from beliefrl import agents
 from beliefrl.analysis.curves import standard_error
 from beliefrl.analysis.groups import Curve, Group, groups, is_finished, last_step
-from beliefrl.analysis.palette import colours
+from beliefrl.analysis.palette import colours, dashes
 from beliefrl.analysis.scalability import wall_clock
 from beliefrl.evaluation import MODES
 from beliefrl.runs import Row, Run
@@ -50,15 +50,10 @@ def told(runs: Sequence[Run], beside: pathlib.Path, unfinished: bool = False) ->
     lines = [group for group in groups(counted, agents.defaults()) if group.curve().steps.size]
     of = {(run.folder, seed): index for index, group in enumerate(lines) for run, seed in group.seeds}
     palette = colours([group.label for group in lines])
-    agent_of = {group.label: group.agent for group in lines}
-    plain_first = sorted(palette, key=lambda label: label != agent_of[label])
-    of_agent = {agent: [label for label in plain_first if agent_of[label] == agent] for agent in agent_of.values()}
+    dash = dashes(list(palette))
     return {
         "tasks": list(dict.fromkeys(group.task for group in lines)),
-        "labels": [
-            {"name": label, "colour": colour, "dash": of_agent[agent_of[label]].index(label)}
-            for label, colour in palette.items()
-        ],
+        "labels": [{"name": label, "colour": colour, "dash": dash[label]} for label, colour in palette.items()],
         "groups": [_group(group) for group in lines],
         "runs": [_run(run, beside, {seed: of.get((run.folder, seed)) for seed in run.seeds}) for run in runs],
     }
