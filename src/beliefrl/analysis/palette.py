@@ -20,19 +20,20 @@ AGENTS = {
 OTHERS = ("#777777", "#8f8f1f", "#3c8fc0", "#b37700", "#5e4fa2", "#0f8b8d")
 
 
-def _has_settings(label: str) -> bool:
-    return " " in label
+def _plain_first(labels: Sequence[str]) -> list[str]:
+    """Each label once, an agent's plain name before those with settings."""
+    return sorted(dict.fromkeys(labels), key=lambda label: " " in label)
 
 
 def colours(labels: Sequence[str]) -> dict[str, str]:
     """A colour "#rrggbb" for each label, whose first word is the agent's name.
 
     A known agent has its own; further labels of it and other agents have the next of the others, in the order of the
-    labels and from the start again when they are used up.
+    labels (plain names first) and from the start again when they are used up.
     """
     chosen: dict[str, str] = {}
     others = 0
-    for label in sorted(dict.fromkeys(labels), key=_has_settings):  # the plain name goes first
+    for label in _plain_first(labels):
         own = AGENTS.get(label.partition(" ")[0])
         if own is None or own in chosen.values():
             own, others = OTHERS[others % len(OTHERS)], others + 1
@@ -44,7 +45,7 @@ def dashes(labels: Sequence[str]) -> dict[str, int]:
     """How many lines of its agent come before each label, the agent's plain name first: the number of its dashes."""
     before: dict[str, int] = {}
     chosen = {}
-    for label in sorted(dict.fromkeys(labels), key=_has_settings):
+    for label in _plain_first(labels):
         agent = label.partition(" ")[0]
         chosen[label] = before.get(agent, 0)
         before[agent] = chosen[label] + 1

@@ -41,8 +41,8 @@ def draw_curves(groups: Sequence[Group], out: pathlib.Path, mode: str = "sampled
     for axis, (task, suffix) in zip(axes, entries, strict=True):
         for group in groups:
             if group.task == task and (not suffix or group.has_success):
-                line = group.curve(mode + suffix), colour[group.label], group.label
-                draw_line(axis, *line, linestyle=style[group.label])
+                label = group.label
+                draw_line(axis, group.curve(mode + suffix), colour[label], label, linestyle=style[label])
         finish(axis, task, "success rate" if suffix else "return")
     add_legend(made, {label: colour[label] for label in labels}, spread(groups), style)
     return save(made, out)
