@@ -3,7 +3,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from beliefrl.nets import MLP, draw, gaussian_kl, gaussian_log_prob, lstm_state, tanh_gaussian
+from beliefrl.nets import (
+    MLP,
+    Scale,
+    draw,
+    gaussian_kl,
+    gaussian_log_prob,
+    lstm_state,
+    observe,
+    standardised,
+    tanh_gaussian,
+    unscaled,
+)
 
 
 def sigmoid(x):
@@ -70,3 +81,27 @@ def test_layers_start_in_pytorchs_bounds():
 def test_rest_continues_from_the_first_layer():
     mlp, x = draw(jax.random.key(0), MLP((3, 8, 8, 2), jnp.tanh)), jnp.arange(3.0)
     np.testing.assert_array_equal(mlp(x), mlp.rest(mlp.layers[0](x)))
+
+
+def test_a_scale_has_the_moments_of_all_valid_vectors_and_makes_them_standard():
+    x = 3.0 + jax.random.normal(jax.random.key(0), (4, 6, 5, 2)) * jnp.array([0.01, 2.0])[None, None, None]
+    valid = jnp.ones((6, 5), bool).at[2, 1:].set(False)
+    known, blind = unscaled(2), unscaled(2)
+    for batch in x:
+        known = observe(known, batch, valid)
+        blind = observe(blind, jnp.where(valid[..., None], batch, 1e6), valid)
+    seen = np.asarray(x)[:, np.asarray(valid)].reshape(-1, 2)
+    np.testing.assert_allclose(known.mean, seen.mean(0), rtol=1e-5)
+    np.testing.assert_allclose(jnp.sqrt(known.variance), seen.std(0), rtol=0.05)  # batches have means of their own
+    jax.tree.map(np.testing.assert_array_equal, known, blind)
+    made = np.asarray(standardised(known, jnp.asarray(seen)))
+    np.testing.assert_allclose(made.mean(0), 0, atol=1e-4)
+    np.testing.assert_allclose(made.std(0), [0.91, 1.0], rtol=0.05)  # 0.01 / (0.01 + 0.001): the quiet stay quieter
+
+
+def test_a_scale_forgets_and_its_entries_are_bounded():
+    old = Scale(jnp.zeros(1), jnp.ones(1), jnp.array(1e6))
+    after = jax.lax.fori_loop(0, 5000, lambda _, scale: observe(scale, jnp.full((3, 1), 7.0), jnp.ones(3, bool)), old)
+    np.testing.assert_allclose(after.mean, 7.0, rtol=0.01)  # e^-5 of the old mean is left
+    np.testing.assert_array_equal(standardised(old, jnp.array([-1e9])), [-10.0])
+    assert float(standardised(None, jnp.array([1e9]))[0]) == 1e9

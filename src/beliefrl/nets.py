@@ -209,3 +209,39 @@ def descend(
     tree: Any = params  # optax's types know only trees of its own making
     updates, state = optimiser.update(gradient, state, tree)  # pyright: ignore[reportArgumentType]
     return optax.apply_updates(tree, updates), state  # pyright: ignore[reportReturnType]
+
+
+class Scale(NamedTuple):
+    """Running moments of a vector that changes while it is learned."""
+
+    mean: Float[Array, " size"]
+    variance: Float[Array, " size"]
+    seen: Float[Array, ""]  # how many batches
+
+
+SCALE_RATE = 1e-3  # of a batch, once there were as many
+QUIETEST = 1e-3  # added to deviations: what varies less stays quieter
+LOUDEST = 10.0
+
+
+def unscaled(size: int) -> Scale:
+    """Of nothing yet: mean 0, variance 1."""
+    return Scale(jnp.zeros(size), jnp.ones(size), jnp.zeros(()))
+
+
+def observe(scale: Scale, x: Float[Array, "*batch size"], valid: Bool[Array, "*batch"]) -> Scale:
+    """With the valid vectors of one more batch; at first every batch counts alike, later the last ones more."""
+    seen = scale.seen + 1
+    rate, flat, weight = jnp.maximum(1 / seen, SCALE_RATE), x.reshape(-1, x.shape[-1]), valid.ravel()
+    weight = weight / jnp.maximum(jnp.sum(weight), 1)
+    mean = scale.mean + rate * (weight @ flat - scale.mean)
+    variance = scale.variance + rate * (weight @ (flat - mean[None]) ** 2 - scale.variance)
+    return Scale(mean, variance, seen)
+
+
+def standardised(scale: Scale | None, x: Float[Array, "*batch size"]) -> Float[Array, "*batch size"]:
+    """x with mean 0 and deviation 1, entries in [-10, 10]; without a scale x itself."""
+    if scale is None:
+        return x
+    mean, deviation = (jnp.broadcast_to(v, x.shape) for v in (scale.mean, jnp.sqrt(scale.variance) + QUIETEST))
+    return jnp.clip((x - mean) / deviation, -LOUDEST, LOUDEST)

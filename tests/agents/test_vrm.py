@@ -11,7 +11,7 @@ import pytest
 from agents.moments import SMALL, SPEC, differ, same
 from beliefrl import agents
 from beliefrl.agents.vrm import VRMAgent
-from beliefrl.nets import draw
+from beliefrl.nets import draw, standardised, unscaled
 from beliefrl.types import Step, UserError, Window, check_choice, time_major
 from beliefrl.variational_model import VRM, Gaussian, Loop, LSTMState, _loop, _scan
 
@@ -206,6 +206,36 @@ def test_a_recomputed_first_impression_is_the_stored_one_up_to_its_sample(state)
     stored = jax.jit(AGENT.batches)(state, window._replace(note=(d_first.swapaxes(0, 1),)), jax.random.key(2))
     again = jax.jit(recompute.batches)(state, window._replace(note=()), jax.random.key(2))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), stored, again)
+
+
+def test_beliefs_of_means_are_without_noise_where_it_acts_and_where_it_learns(state):
+    window = windows(jax.random.key(1), 10)
+    agents = [dataclasses.replace(AGENT, store_first_impression=False, sample_belief=each) for each in (False, True)]
+    mean, sampled = ([jax.jit(a.batches)(state, window, jax.random.key(k)).belief for k in (2, 3)] for a in agents)
+    np.testing.assert_array_equal(*mean)
+    assert differ(*sampled)
+    memory, act = AGENT.reset(SPEC), jax.jit(agents[0].act)
+    for t in range(AGENT.burn_in + 1):  # until the belief of the first transition
+        step = jax.tree.map(lambda leaf, t=t: leaf[0, t], window.step)
+        _, memory = act(state, memory, step, jax.random.key(t), jnp.array(True))
+    belief = jnp.concatenate([memory.first.d, memory.keep.d])
+    np.testing.assert_allclose(belief, mean[0][0, 0, : 2 * AGENT.d_size], rtol=1e-5, atol=1e-6)
+    assert differ(*(act(state, memory, step, jax.random.key(k), jnp.array(True))[0] for k in (1, 2)))  # still samples
+
+
+def test_standardised_beliefs_are_what_the_controller_learns_from_and_acts_on(state):
+    agent, window = dataclasses.replace(AGENT, standardise=True), windows(jax.random.key(1), 12)
+    fresh = state._replace(scale=unscaled(2 * AGENT.d_size + SPEC.obs_dim + 1))
+    after, batches, _ = jax.jit(agent.begin_cycle)(fresh, window, jax.random.key(2))
+    plain, others, _ = jax.jit(AGENT.begin_cycle)(state, window, jax.random.key(2))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7), after._replace(scale=None), plain)
+    np.testing.assert_allclose(batches.belief, standardised(after.scale, others.belief), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(batches.next_belief, standardised(after.scale, others.next_belief), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(jnp.mean(batches.belief, (0, 1)), 0, atol=1e-4)  # of the one batch that was seen
+    step, mode = jax.tree.map(lambda leaf: leaf[0, 0], window.step), jnp.array(False)
+    action, memory = jax.jit(agent.act)(after, agent.reset(SPEC), step, jax.random.key(3), mode)
+    belief = standardised(after.scale, jnp.concatenate([memory.first.d, memory.keep.d, step.obs, step.reward[None]]))
+    np.testing.assert_allclose(action, agent.choose(after.controller, belief, jax.random.key(3), mode), rtol=1e-5)
 
 
 def test_decoding_from_the_prior_and_sums_are_other_losses(state):

@@ -14,7 +14,7 @@ Departures:
 """
 
 import dataclasses
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents.sac import SAC, Metrics, split_updates
-from beliefrl.nets import Gaussian, LSTMState, descend, draw
+from beliefrl.nets import Gaussian, LSTMState, Scale, descend, draw, observe, standardised, unscaled
 from beliefrl.returns import transition_batch
 from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean
 from beliefrl.types import (
@@ -56,6 +56,7 @@ class State(NamedTuple):
     first_optimiser: optax.OptState
     keep_optimiser: optax.OptState
     controller_optimiser: OptimiserState
+    scale: Scale | None  # of beliefs, where they are standardised
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,6 +102,10 @@ class VRMAgent(SAC):
     which they overhang at both ends (the authors' code)."""
     store_first_impression: bool = True
     """Keep the first-impression model's d in the replay instead of computing it again for every update."""
+    sample_belief: bool = True
+    """Form beliefs with a sample of z (the authors' code); if not, with the posterior's mean: they have no noise."""
+    standardise: bool = False
+    """Give the controller beliefs of mean 0 and deviation 1, by running moments: quiet entries are heard as well."""
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
@@ -162,14 +167,10 @@ class VRMAgent(SAC):
         first, keep = draw(key_models, (bounds if self.has_first else None, bounds if self.has_keep else None))
         belief = (self.has_first + self.has_keep) * self.d_size + x
         controller, controller_optimiser = self.init_controller(key_controller, belief, spec.action_dim)
-        return State(
-            first,
-            keep,
-            controller,
-            self.model_optimiser.init(first),  # pyright: ignore[reportArgumentType]
-            self.model_optimiser.init(keep),  # pyright: ignore[reportArgumentType]
-            controller_optimiser,
-        )
+        models: Any = first, keep
+        of_first, of_keep = map(self.model_optimiser.init, models)
+        scale = unscaled(belief) if self.standardise else None
+        return State(first, keep, controller, of_first, of_keep, controller_optimiser, scale)
 
     # Acting (Figure 2b)
 
@@ -183,7 +184,7 @@ class VRMAgent(SAC):
         """One model's state after one more moment."""
         if vrm is None:
             return None
-        noise = jnp.where(explore, jax.random.normal(key, (self.z_size,)), 0.0)
+        noise = jnp.where(explore & self.sample_belief, jax.random.normal(key, (self.z_size,)), 0.0)
         start = jax.tree.map(lambda leaf: leaf[None], memory)
         moment = (perception(step), step.prev_action, step.is_first, noise)
         inferred = vrm.infer(start, *(leaf[None, None] for leaf in moment))
@@ -198,7 +199,7 @@ class VRMAgent(SAC):
             self.perceive(state.keep, memory.keep, step, key_keep, explore),
         )
         belief = jnp.concatenate([*(part.d for part in memory if part is not None), perception(step)])
-        return self.choose(state.controller, belief, key_action, explore), memory
+        return self.choose(state.controller, standardised(state.scale, belief), key_action, explore), memory
 
     def note(self, memory: Memory) -> tuple[Float[Array, " d"], ...]:
         """d_t of the first-impression model, or nothing."""
@@ -259,10 +260,11 @@ class VRMAgent(SAC):
         kl, log_likelihood = map(mean, elbo_terms(vrm, inferred, *inputs, self.elbo_scaling, prior_noise))
         return kl - log_likelihood, {"kl": kl, "log_likelihood": log_likelihood, "negative_elbo": kl - log_likelihood}
 
-    def unroll(self, vrm: VRM, windows: Window, key: Key[Array, ""]) -> LSTMState:
+    def unroll(self, vrm: VRM, windows: Window, key: Key[Array, ""], sampled: bool = True) -> LSTMState:
         """A model's states at moments (time-major) that begin with the empty state; leaves (time, batch, d)."""
-        step, start = windows.step, vrm.start(windows.exists.shape[1])
-        return vrm.infer(start, perception(step), step.prev_action, step.is_first, self.noise(key, windows)).state
+        step, start, noise = windows.step, vrm.start(windows.exists.shape[1]), self.noise(key, windows)
+        noise = noise if sampled else jnp.zeros_like(noise)
+        return vrm.infer(start, perception(step), step.prev_action, step.is_first, noise).state
 
     def noise(self, key: Key[Array, ""], windows: Window) -> Float[Array, "time batch z"]:
         return jax.random.normal(key, (*windows.exists.shape, self.z_size))
@@ -275,7 +277,12 @@ class VRMAgent(SAC):
         for_model = jax.tree.map(lambda leaf: leaf[:count], windows)
         for_controller = jax.tree.map(lambda leaf: leaf[count:], windows)
         state, metrics = self.learn_keep(state, for_model, key_model)
-        return state, self.batches(state, for_controller, key_belief), metrics
+        batches = self.batches(state, for_controller, key_belief)
+        if state.scale is not None:
+            scale = observe(state.scale, batches.belief, batches.valid)
+            belief, next_belief = standardised(scale, batches.belief), standardised(scale, batches.next_belief)
+            state, batches = state._replace(scale=scale), batches._replace(belief=belief, next_belief=next_belief)
+        return state, batches, metrics
 
     def batches(self, state: State, windows: Window, key: Key[Array, ""]) -> Batch:
         """The windows' transitions with their beliefs, split for a cycle's updates: leaves (update, batch, ...)."""
@@ -283,10 +290,10 @@ class VRMAgent(SAC):
         moments = time_major(windows, 0, None)
         parts = [perception(moments.step)]
         if state.keep is not None:
-            parts.insert(0, self.unroll(state.keep, moments, key_keep).d)
+            parts.insert(0, self.unroll(state.keep, moments, key_keep, self.sample_belief).d)
         if state.first is not None:
-            stored = self.store_first_impression
-            parts.insert(0, moments.note[0] if stored else self.unroll(state.first, moments, key_first).d)
+            stored, sampled = self.store_first_impression, self.sample_belief
+            parts.insert(0, moments.note[0] if stored else self.unroll(state.first, moments, key_first, sampled).d)
         belief = jnp.concatenate(parts, axis=-1)
         belief, step = belief[self.burn_in :], time_major(windows, self.burn_in, None).step
         valid = transitions(windows, self.burn_in).T
