@@ -77,6 +77,9 @@ def main():
         }
         print(path)
         tell("deviation", np.concatenate([states for _, states in episodes[FITTED:]]).std(0))
+        remembered = np.concatenate([perceived(steps, False) for steps, _ in episodes])[:, -2 * agent.d_size :]
+        first, keep = (np.median(part.std(0)) for part in np.split(remembered, 2, axis=1))
+        print(f"median deviation of an entry of d: first-impression {first:.4f}, keep-learning {keep:.4f}")
         for name, way in ways.items():
             pairs = [(way(steps), states) for steps, states in episodes]
             tell(name, unknown(pairs[:FITTED], pairs[FITTED:]))

@@ -103,7 +103,7 @@ class VRMAgent(SAC):
     store_first_impression: bool = True
     """Keep the first-impression model's d in the replay instead of computing it again for every update."""
     sample_belief: bool = True
-    """Form beliefs with a sample of z (the authors' code); if not, with the posterior's mean: they have no noise."""
+    """Form beliefs with a sample of z, as the models learn; if not, with the posterior's mean: they have no noise."""
     standardise: bool = False
     """Give the controller beliefs of mean 0 and deviation 1, by running moments: quiet entries are heard as well."""
 
