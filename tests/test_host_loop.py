@@ -20,7 +20,7 @@ from test_phases import MODELS, SEQUENCES, SHARED, leaves, trained
 from worlds import Counting, CountingAgent
 from wrong import Fine, Killed, Raising
 
-SMALL = {"vrm": MODELS | SEQUENCES, "sac-mlp": {"batch_size": 8, "pretrain_updates": 10}}
+SMALL = {"vrm": MODELS | SEQUENCES, "sac-mlp": {"batch_size": 8, "pretrain_updates": 10, "standardise": True}}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,9 +12,9 @@ SHARED = {"step_start_rl": 20, "policy_layers": (8,), "value_layers": (8,)}
 MODELS = {"train_times_fivrm": 10, "d_size": 8, "z_size": 4, "hidden_size": 8}
 SEQUENCES = {"seq_len": 8, "burn_in": 4, "batch_size": 2}
 SMALL = {
-    "vrm": MODELS | SEQUENCES,
+    "vrm": MODELS | SEQUENCES | {"standardise": True},
     "vrm-single": MODELS | SEQUENCES,
-    "sac-mlp": {"batch_size": 8, "pretrain_updates": 10},
+    "sac-mlp": {"batch_size": 8, "pretrain_updates": 10, "standardise": True},
     "sac-lstm": {"d_size": 8, "pretrain_updates": 10} | SEQUENCES,
     "slac": {"z1_size": 2, "z2_size": 4, "model_layers": (8,), "batch_size": 2, "pretrain_updates": 10},
 }

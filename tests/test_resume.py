@@ -23,7 +23,7 @@ from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.types import UserError
 from wrong import Fine
 
-SIZES = {"policy_layers": (8,), "value_layers": (8,), "batch_size": 8}
+SIZES = {"policy_layers": (8,), "value_layers": (8,), "batch_size": 8, "standardise": True}
 AGENT = agents.make("sac-mlp", step_start_rl=20, pretrain_updates=150, **SIZES)
 OPTIONS = {"steps": 240, "seeds": 2, "eval_every": 120, "eval_episodes": 1, "checkpoint_steps": 1}
 
@@ -71,7 +71,7 @@ def test_a_crashed_training_goes_on_to_the_last_bit(whole, tmp_path, share):
     assert files(tmp_path / "run") == files(folder)
 
 
-LINE = "train sac-mlp pendulum-v --step-start-rl 20 --pretrain-updates 150 --policy-layers 8 --value-layers 8"
+LINE = "train sac-mlp pendulum-v --standardise --step-start-rl 20 --pretrain-updates 150 --policy-layers 8 --value-layers 8"
 LINE += " --batch-size 8 --steps 240 --seeds 2 --eval-every 120 --eval-episodes 1 --checkpoint-steps 1 --resume --out"
 
 

@@ -1,5 +1,6 @@
 """SAC-MLP: the golden update through its own windows, and what counts nowhere."""
 
+import dataclasses
 import pathlib
 
 import jax
@@ -13,6 +14,7 @@ from beliefrl.types import Step, UserError, Window
 
 GOLDEN = pathlib.Path(__file__).parents[1] / "golden" / "sac.npz"
 AGENT = SACMLPAgent(policy_layers=(8, 8), value_layers=(8, 8), batch_size=6)
+STANDARDISED = dataclasses.replace(AGENT, standardise=True)
 
 
 @pytest.fixture(scope="module")
@@ -48,14 +50,29 @@ def test_pairs_across_episodes_enter_no_loss(state):
     assert not np.allclose(one.step.obs[2], other.step.obs[2])
 
 
-def test_pretraining_is_an_update_of_the_controller(state):
-    window = windows(jax.random.key(1), 6, 2)
-    after, _ = jax.jit(AGENT.pretrain)(state, window, jax.random.key(2))
-    begun, batches, metrics = jax.jit(AGENT.begin_cycle)(state, window, jax.random.key(7))
-    again, _ = jax.jit(AGENT.update)(begun, jax.tree.map(lambda leaf: leaf[0], batches), jax.random.key(2))
+@pytest.mark.parametrize("agent", [AGENT, STANDARDISED])
+def test_pretraining_is_an_update_of_the_controller(agent):
+    window, state = windows(jax.random.key(1), 6, 2), agent.init(jax.random.key(0), SPEC)
+    after, _ = jax.jit(agent.pretrain)(state, window, jax.random.key(2))
+    begun, batches, metrics = jax.jit(agent.begin_cycle)(state, window, jax.random.key(7))
+    again, _ = jax.jit(agent.update)(begun, jax.tree.map(lambda leaf: leaf[0], batches), jax.random.key(2))
     assert metrics == {}
     assert differ(after.controller, state.controller)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7), after, again)
+
+
+def test_standardised_it_does_not_matter_in_which_units_observations_are():
+    window, state = windows(jax.random.key(1), 6, 2), STANDARDISED.init(jax.random.key(0), SPEC)
+    units = np.array([[[100.0, 20.0, 0.5]]], np.float32)
+    others = window._replace(step=window.step._replace(obs=(window.step.obs + 7) * units))
+    actions, learn = [], jax.jit(STANDARDISED.pretrain)
+    for each in (window, others):
+        after, _ = learn(state, each, jax.random.key(2))
+        step = jax.tree.map(lambda leaf: leaf[3, 1], each.step)
+        actions.append(STANDARDISED.act(after, (), step, jax.random.key(3), jnp.array(False))[0])
+    np.testing.assert_allclose(*actions, rtol=0.01)  # but for what keeps quiet entries from infinity
+    raw = AGENT.act(after._replace(scale=None), (), step, jax.random.key(3), jnp.array(False))[0]
+    assert np.abs(raw - actions[0]).max() > 0.05
 
 
 @pytest.mark.parametrize("wrong", [{"batch_size": 0}, {"pretrain_updates": -1}, {"gamma": 2.0}, {"policy_layers": ()}])

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.nets import tanh_gaussian
+from beliefrl.nets import Scale, observe, standardised, tanh_gaussian
 from beliefrl.soft_actor_critic import (
     Batch,
     Controller,
@@ -113,6 +113,15 @@ class SAC:
         gradient, metrics = jax.grad(self.controller_loss, has_aux=True)(controller, batch, key)
         controller, state = update(self.optimisers, state, controller, gradient, self.tau)
         return controller, state, metrics
+
+
+def standardise_beliefs(scale: Scale | None, batch: Batch) -> tuple[Scale | None, Batch]:
+    """What a batch or more of them tell of the beliefs' moments, and their beliefs by that; without a scale nothing."""
+    if scale is None:
+        return None, batch
+    scale = observe(scale, batch.belief, batch.valid)
+    belief, next_belief = standardised(scale, batch.belief), standardised(scale, batch.next_belief)
+    return scale, batch._replace(belief=belief, next_belief=next_belief)
 
 
 def for_each_update(windows: Any, count: int) -> Any:

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import jax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents.sac import SAC, Metrics, for_each_update
+from beliefrl.agents.sac import SAC, Metrics, for_each_update, standardise_beliefs
+from beliefrl.nets import Scale, standardised, unscaled
 from beliefrl.returns import transition_batch
 from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState
 from beliefrl.types import Spec, Step, Window, WindowShape, check_range, time_major, transitions
@@ -21,6 +22,7 @@ class State(NamedTuple):
 
     controller: Controller
     controller_optimiser: OptimiserState
+    scale: Scale | None  # of observations, where they are standardised
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,6 +33,8 @@ class SACMLPAgent(SAC):
     """Transitions in an update (Appendix F: as many as the other agents')."""
     pretrain_updates: int = 5000
     """Updates of the controller at step_start_rl, as many as VRM's pre-training has (Section 5; 0 is off)."""
+    standardise: bool = False
+    """Give the controller observations of mean 0 and deviation 1, by running moments: quiet entries are heard as well."""
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
@@ -52,7 +56,8 @@ class SACMLPAgent(SAC):
         return self.batch_size * self.cycle_updates
 
     def init(self, key: Key[Array, ""], spec: Spec) -> State:
-        return State(*self.init_controller(key, spec.obs_dim, spec.action_dim))
+        scale = unscaled(spec.obs_dim) if self.standardise else None
+        return State(*self.init_controller(key, spec.obs_dim, spec.action_dim), scale)
 
     def reset(self, spec: Spec) -> tuple[()]:
         return ()
@@ -60,17 +65,19 @@ class SACMLPAgent(SAC):
     def act(
         self, state: State, memory: tuple[()], step: Step, key: Key[Array, ""], explore: Bool[Array, ""]
     ) -> tuple[Float[Array, " action"], tuple[()]]:
-        return self.choose(state.controller, step.obs, key, explore), memory
+        return self.choose(state.controller, standardised(state.scale, step.obs), key, explore), memory
 
     def note(self, memory: tuple[()]) -> tuple[()]:
         return ()
 
     def pretrain(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Metrics]:
-        return self.update(state, self.batch(windows), key)
+        scale, batch = standardise_beliefs(state.scale, self.batch(windows))
+        return self.update(state._replace(scale=scale), batch, key)
 
     def begin_cycle(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Batch, Metrics]:
         """The batch of each update."""
-        return state, for_each_update(self.batch(windows), self.batch_size), {}
+        scale, batch = standardise_beliefs(state.scale, self.batch(windows))
+        return state._replace(scale=scale), for_each_update(batch, self.batch_size), {}
 
     def batch(self, windows: Window) -> Batch:
         """The windows' first transitions."""
@@ -80,4 +87,4 @@ class SACMLPAgent(SAC):
 
     def update(self, state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
         controller, optimiser, metrics = self.learn_controller(state.controller, state.controller_optimiser, batch, key)
-        return State(controller, optimiser), metrics
+        return state._replace(controller=controller, controller_optimiser=optimiser), metrics

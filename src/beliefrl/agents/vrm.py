@@ -21,8 +21,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents.sac import SAC, Metrics, split_updates
-from beliefrl.nets import Gaussian, LSTMState, Scale, descend, draw, observe, standardised, unscaled
+from beliefrl.agents.sac import SAC, Metrics, split_updates, standardise_beliefs
+from beliefrl.nets import Gaussian, LSTMState, Scale, descend, draw, standardised, unscaled
 from beliefrl.returns import transition_batch
 from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean
 from beliefrl.types import (
@@ -277,12 +277,8 @@ class VRMAgent(SAC):
         for_model = jax.tree.map(lambda leaf: leaf[:count], windows)
         for_controller = jax.tree.map(lambda leaf: leaf[count:], windows)
         state, metrics = self.learn_keep(state, for_model, key_model)
-        batches = self.batches(state, for_controller, key_belief)
-        if state.scale is not None:
-            scale = observe(state.scale, batches.belief, batches.valid)
-            belief, next_belief = standardised(scale, batches.belief), standardised(scale, batches.next_belief)
-            state, batches = state._replace(scale=scale), batches._replace(belief=belief, next_belief=next_belief)
-        return state, batches, metrics
+        scale, batches = standardise_beliefs(state.scale, self.batches(state, for_controller, key_belief))
+        return state._replace(scale=scale), batches, metrics
 
     def batches(self, state: State, windows: Window, key: Key[Array, ""]) -> Batch:
         """The windows' transitions with their beliefs, split for a cycle's updates: leaves (update, batch, ...)."""
