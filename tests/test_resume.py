@@ -71,8 +71,8 @@ def test_a_crashed_training_goes_on_to_the_last_bit(whole, tmp_path, share):
     assert files(tmp_path / "run") == files(folder)
 
 
-LINE = "train sac-mlp pendulum-v --standardise --step-start-rl 20 --pretrain-updates 150 --policy-layers 8 --value-layers 8"
-LINE += " --batch-size 8 --steps 240 --seeds 2 --eval-every 120 --eval-episodes 1 --checkpoint-steps 1 --resume --out"
+LINE = "train sac-mlp pendulum-v --step-start-rl 20 --pretrain-updates 150 --policy-layers 8 --value-layers 8"
+LINE += " --batch-size 8 --standardise --steps 240 --seeds 2 --eval-every 120 --eval-episodes 1 --checkpoint-steps 1 --resume --out"
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ class SACMLPAgent(SAC):
     pretrain_updates: int = 5000
     """Updates of the controller at step_start_rl, as many as VRM's pre-training has (Section 5; 0 is off)."""
     standardise: bool = False
-    """Give the controller observations of mean 0 and deviation 1, by running moments: quiet entries are heard as well."""
+    """Give the controller observations of mean 0 and deviation 1, by running moments, so that none is too quiet."""
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
