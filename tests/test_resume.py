@@ -72,7 +72,8 @@ def test_a_crashed_training_goes_on_to_the_last_bit(whole, tmp_path, share):
 
 
 LINE = "train sac-mlp pendulum-v --step-start-rl 20 --pretrain-updates 150 --policy-layers 8 --value-layers 8"
-LINE += " --batch-size 8 --standardise --steps 240 --seeds 2 --eval-every 120 --eval-episodes 1 --checkpoint-steps 1 --resume --out"
+LINE += " --batch-size 8 --standardise --steps 240 --seeds 2 --eval-every 120 --eval-episodes 1"
+LINE += " --checkpoint-steps 1 --resume --out"
 
 
 @pytest.mark.parametrize(
