@@ -116,7 +116,7 @@ class SAC:
 
 
 def standardise_beliefs(scale: Scale | None, batch: Batch) -> tuple[Scale | None, Batch]:
-    """What a batch or more of them tell of the beliefs' moments, and their beliefs by that; without a scale nothing."""
+    """The scale after a batch (or those of a cycle), and the batch standardised by it; without a scale, as it is."""
     if scale is None:
         return None, batch
     scale = observe(scale, batch.belief, batch.valid)
