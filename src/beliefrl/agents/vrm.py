@@ -284,12 +284,15 @@ class VRMAgent(SAC):
         """The windows' transitions with their beliefs, split for a cycle's updates: leaves (update, batch, ...)."""
         key_first, key_keep = jax.random.split(key)
         moments = time_major(windows, 0, None)
+
+        def d(vrm: VRM, key: Key[Array, ""]) -> Float[Array, "time batch d"]:
+            return self.unroll(vrm, moments, key, self.sample_belief).d
+
         parts = [perception(moments.step)]
         if state.keep is not None:
-            parts.insert(0, self.unroll(state.keep, moments, key_keep, self.sample_belief).d)
+            parts.insert(0, d(state.keep, key_keep))
         if state.first is not None:
-            stored, sampled = self.store_first_impression, self.sample_belief
-            parts.insert(0, moments.note[0] if stored else self.unroll(state.first, moments, key_first, sampled).d)
+            parts.insert(0, moments.note[0] if self.store_first_impression else d(state.first, key_first))
         belief = jnp.concatenate(parts, axis=-1)
         belief, step = belief[self.burn_in :], time_major(windows, self.burn_in, None).step
         valid = transitions(windows, self.burn_in).T
