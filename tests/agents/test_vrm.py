@@ -202,7 +202,7 @@ def test_a_recomputed_first_impression_is_the_stored_one_up_to_its_sample(state)
     window = windows(jax.random.key(1), 10)
     key_first, _ = jax.random.split(jax.random.key(2))
     moments = time_major(window, 0, None)
-    d_first = jax.jit(AGENT.unroll)(state.first, moments, key_first).d
+    d_first = jax.jit(AGENT.unroll)(state.first, moments, AGENT.noise(key_first, moments)).d
     stored = jax.jit(AGENT.batches)(state, window._replace(note=(d_first.swapaxes(0, 1),)), jax.random.key(2))
     again = jax.jit(recompute.batches)(state, window._replace(note=()), jax.random.key(2))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), stored, again)

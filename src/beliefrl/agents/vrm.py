@@ -246,7 +246,8 @@ class VRMAgent(SAC):
         before, after = time_major(windows, 0, self.burn_in), time_major(windows, self.burn_in, -1)
         start = vrm.start(self.batch_size)
         if self.burn_in:
-            start = jax.tree.map(lambda leaf: leaf[-1], self.unroll(jax.lax.stop_gradient(vrm), before, key_burn_in))
+            noise = self.noise(key_burn_in, before)
+            start = jax.tree.map(lambda leaf: leaf[-1], self.unroll(jax.lax.stop_gradient(vrm), before, noise))
         inputs = (perception(after.step), after.step.prev_action)
         inferred = vrm.infer(start, *inputs, after.step.is_first, self.noise(key_infer, after))
 
@@ -260,10 +261,9 @@ class VRMAgent(SAC):
         kl, log_likelihood = map(mean, elbo_terms(vrm, inferred, *inputs, self.elbo_scaling, prior_noise))
         return kl - log_likelihood, {"kl": kl, "log_likelihood": log_likelihood, "negative_elbo": kl - log_likelihood}
 
-    def unroll(self, vrm: VRM, windows: Window, key: Key[Array, ""], sampled: bool = True) -> LSTMState:
+    def unroll(self, vrm: VRM, windows: Window, noise: Float[Array, "time batch z"]) -> LSTMState:
         """A model's states at moments (time-major) that begin with the empty state; leaves (time, batch, d)."""
-        step, start, noise = windows.step, vrm.start(windows.exists.shape[1]), self.noise(key, windows)
-        noise = noise if sampled else jnp.zeros_like(noise)
+        step, start = windows.step, vrm.start(windows.exists.shape[1])
         return vrm.infer(start, perception(step), step.prev_action, step.is_first, noise).state
 
     def noise(self, key: Key[Array, ""], windows: Window) -> Float[Array, "time batch z"]:
@@ -282,17 +282,14 @@ class VRMAgent(SAC):
 
     def batches(self, state: State, windows: Window, key: Key[Array, ""]) -> Batch:
         """The windows' transitions with their beliefs, split for a cycle's updates: leaves (update, batch, ...)."""
-        key_first, key_keep = jax.random.split(key)
         moments = time_major(windows, 0, None)
-
-        def d(vrm: VRM, key: Key[Array, ""]) -> Float[Array, "time batch d"]:
-            return self.unroll(vrm, moments, key, self.sample_belief).d
-
+        of_first, of_keep = (self.sample_belief * self.noise(k, moments) for k in jax.random.split(key))
         parts = [perception(moments.step)]
         if state.keep is not None:
-            parts.insert(0, d(state.keep, key_keep))
+            parts.insert(0, self.unroll(state.keep, moments, of_keep).d)
         if state.first is not None:
-            parts.insert(0, moments.note[0] if self.store_first_impression else d(state.first, key_first))
+            stored = self.store_first_impression
+            parts.insert(0, moments.note[0] if stored else self.unroll(state.first, moments, of_first).d)
         belief = jnp.concatenate(parts, axis=-1)
         belief, step = belief[self.burn_in :], time_major(windows, self.burn_in, None).step
         valid = transitions(windows, self.burn_in).T
