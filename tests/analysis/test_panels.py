@@ -57,6 +57,24 @@ def test_the_dashes_of_a_line_are_those_of_its_legend(drawn, tmp_path):
     assert len(set(style.values())) == 2
 
 
+@pytest.mark.parametrize("tasks", [("pendulum",), ("pendulum", "cartpole", "cartpole-v")])
+def test_a_legend_is_as_wide_as_its_figure_at_most_and_hides_no_panel(drawn, tmp_path, tasks):
+    few = {f"setting_{number}": number for number in range(8)}
+    settings = few, {**few, "setting_0": 9}, dict.fromkeys(few, 100_000)
+    runs = [
+        a_run(tmp_path / f"{task}-{number}", [flat(1.0, 3.0)], agent="vrm", task=task, settings=each)
+        for task in tasks
+        for number, each in enumerate(settings)
+    ]
+    panels.draw_curves(groups(runs), tmp_path / "picture")
+    (figure,) = drawn
+    figure.canvas.draw()
+    legend, whole = figure.legends[0].get_window_extent(), figure.bbox
+    assert whole.x0 <= legend.x0 < legend.x1 <= whole.x1
+    assert all(axis.get_window_extent().y0 > legend.y1 for axis in figure.axes)
+    assert all(axis.get_window_extent().height > whole.height / 3 for axis in figure.axes)
+
+
 def test_both_files_are_written(two_tasks, tmp_path):
     path = panels.draw_curves(two_tasks, tmp_path / "picture.pdf")
     assert path == tmp_path / "picture.png"

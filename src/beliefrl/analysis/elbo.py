@@ -41,7 +41,8 @@ def draw_elbo(groups: Sequence[Group], out: pathlib.Path, mode: str = "sampled")
     if not shown:
         raise UserError("None of these runs has a model that keeps learning: give runs of vrm.")
     colour = colours([group.label for group, _ in shown])
-    made, axes = panels(len(shown), 2)
+    lines = {group.label: colour[group.label] for group, _ in shown} | {"loss of the model (dashed)": GREY}
+    made, axes = panels(len(shown), [*lines])
     for axis, (group, loss) in zip(axes, shown, strict=True):
         draw_line(axis, group.curve(mode), colour[group.label], "return")
         finish(axis, f"{group.label} on {group.task}", "return")
@@ -50,6 +51,5 @@ def draw_elbo(groups: Sequence[Group], out: pathlib.Path, mode: str = "sampled")
         right.set_ylabel("loss of the model (dashed)", fontsize=9)
         right.tick_params(labelsize=8)
         right.spines["top"].set_visible(False)
-    lines = {group.label: colour[group.label] for group, _ in shown} | {"loss of the model (dashed)": GREY}
     add_legend(made, lines, spread([group for group, _ in shown]))
     return save(made, out)

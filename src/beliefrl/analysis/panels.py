@@ -1,6 +1,7 @@
 """Learning curves of many agents on many tasks: a panel a task, a line an agent (Section 5, Appendices C, F)."""
 
 import pathlib
+import textwrap
 from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
@@ -14,6 +15,7 @@ from beliefrl.types import UserError
 
 COLUMNS = 3
 PANEL = (3.5, 2.7)  # inches
+HANDLE, LETTER = 0.6, 0.072  # inches of a legend's entry beside its label, and of a letter there
 DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (7, 2, 1.5, 2)), (0, (3, 1, 1, 1, 1, 1)))  # in widths of the line
 
 
@@ -37,7 +39,7 @@ def draw_curves(groups: Sequence[Group], out: pathlib.Path, mode: str = "sampled
     labels = list(dict.fromkeys(group.label for group in groups))
     colour = colours(labels)
     style = {label: DASHES[number % len(DASHES)] for label, number in dashes(labels).items()}
-    made, axes = panels(len(entries), len(labels))
+    made, axes = panels(len(entries), labels)
     for axis, (task, suffix) in zip(axes, entries, strict=True):
         for group in groups:
             if group.task == task and (not suffix or group.has_success):
@@ -64,12 +66,13 @@ def tasks_of(groups: Sequence[Group]) -> list[str]:
     return list(dict.fromkeys(group.task for group in groups))
 
 
-def panels(count: int, lines: int) -> tuple[Any, list[Any]]:
-    """A figure with so many panels, and with room for a legend below them."""
+def panels(count: int, labels: Sequence[str]) -> tuple[Any, list[Any]]:
+    """A figure with so many panels, and with room for a legend of these labels below them."""
     columns = min(COLUMNS, count)
     rows = -(-count // columns)
     width = max(columns * PANEL[0], 4.5)
-    made = figure(width, rows * PANEL[1] + 0.25 * -(-lines // legend_columns(width)) + 0.2)
+    lines = sum(label.count("\n") + 1 for label in wrapped(labels, width))
+    made = figure(width, rows * PANEL[1] + 0.25 * -(-lines // legend_columns(labels, width)) + 0.2)
     axes = list(made.subplots(rows, columns, squeeze=False).flat)
     for unused in axes[count:]:
         unused.remove()
@@ -106,20 +109,26 @@ def _locator() -> Any:
     return MaxNLocator(5)
 
 
-def legend_columns(width: float) -> int:
-    return max(1, int(width / 2.1))
+def legend_columns(labels: Sequence[str], width: float) -> int:
+    """How many labels stand side by side in a figure so many inches wide."""
+    return max(1, int(width / max(2.1, HANDLE + LETTER * max(map(len, labels)))))
+
+
+def wrapped(labels: Sequence[str], width: float) -> list[str]:
+    """Labels of as many lines as they need to be no wider than the figure."""
+    return [textwrap.fill(label, int((width - HANDLE) / LETTER)) for label in labels]
 
 
 def add_legend(made: Any, colour: dict[str, str], title: str, style: dict[str, Any] | None = None) -> None:
     """One legend below all panels; lines are solid but for those with a style."""
     from matplotlib.lines import Line2D
 
-    dash = style or {}
+    dash, width = style or {}, made.get_figwidth()
     lines = [
-        Line2D([], [], color=each, linewidth=2, label=label, linestyle=dash.get(label, "-"))
-        for label, each in colour.items()
+        Line2D([], [], color=each, linewidth=2, label=text, linestyle=dash.get(label, "-"))
+        for (label, each), text in zip(colour.items(), wrapped([*colour], width), strict=True)
     ]
-    columns = legend_columns(made.get_figwidth())
+    columns = legend_columns([*colour], width)
     made.legend(
         handles=lines,
         loc="outside lower center",
