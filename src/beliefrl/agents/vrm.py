@@ -266,8 +266,9 @@ class VRMAgent(SAC):
         step, start = windows.step, vrm.start(windows.exists.shape[1])
         return vrm.infer(start, perception(step), step.prev_action, step.is_first, noise).state
 
-    def noise(self, key: Key[Array, ""], windows: Window) -> Float[Array, "time batch z"]:
-        return jax.random.normal(key, (*windows.exists.shape, self.z_size))
+    def noise(self, key: Key[Array, ""], windows: Window, sampled: bool = True) -> Float[Array, "time batch z"]:
+        shape = *windows.exists.shape, self.z_size
+        return jax.random.normal(key, shape) if sampled else jnp.zeros(shape)
 
     # Learning the controller (Figure 2a)
 
@@ -283,15 +284,14 @@ class VRMAgent(SAC):
     def batches(self, state: State, windows: Window, key: Key[Array, ""]) -> Batch:
         """The windows' transitions with their beliefs, split for a cycle's updates: leaves (update, batch, ...)."""
         moments = time_major(windows, 0, None)
-        of_first, of_keep = (self.sample_belief * self.noise(k, moments) for k in jax.random.split(key))
+        of_first, of_keep = (self.noise(k, moments, self.sample_belief) for k in jax.random.split(key))
         parts = [perception(moments.step)]
         if state.keep is not None:
             parts.insert(0, self.unroll(state.keep, moments, of_keep).d)
         if state.first is not None:
             stored = self.store_first_impression
             parts.insert(0, moments.note[0] if stored else self.unroll(state.first, moments, of_first).d)
-        belief = jnp.concatenate(parts, axis=-1)
-        belief, step = belief[self.burn_in :], time_major(windows, self.burn_in, None).step
+        belief, step = jnp.concatenate(parts, axis=-1)[self.burn_in :], time_major(windows, self.burn_in, None).step
         valid = transitions(windows, self.burn_in).T
         return split_updates(transition_batch(step, valid, belief, belief, self.n_step, self.gamma), self.batch_size)
 

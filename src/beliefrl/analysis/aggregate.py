@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from beliefrl.analysis.groups import Group
 from beliefrl.analysis.palette import colours
-from beliefrl.analysis.panels import add_legend, counts, tasks_of, with_curve
+from beliefrl.analysis.panels import add_legend, counts, legend_height, tasks_of, with_curve
 from beliefrl.figures import figure, save
 from beliefrl.types import UserError
 
@@ -27,6 +27,7 @@ BOUNDS = {  # returns of a random policy (uniform actions, 1,000 episodes, measu
     "target-reaching": (0.7, 140.0),
 }
 RESAMPLES = 2_000
+WIDTH = 8.0  # inches
 LEVEL = 0.95
 
 
@@ -93,7 +94,7 @@ def draw_aggregate(groups: Sequence[Group], out: pathlib.Path, mode: str = "samp
     """
     table = scores(groups, mode)
     colour = colours(list(table))
-    made = figure(8.0, 3.2)
+    made = figure(WIDTH, 2.95 + legend_height([*table], WIDTH))
     left, right = made.subplots(1, 2, width_ratios=(1, 1.3))
     thresholds = np.linspace(0.0, 1.0, 101)
     for row, (label, values) in enumerate(reversed(table.items())):

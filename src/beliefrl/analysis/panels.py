@@ -71,8 +71,7 @@ def panels(count: int, labels: Sequence[str]) -> tuple[Any, list[Any]]:
     columns = min(COLUMNS, count)
     rows = -(-count // columns)
     width = max(columns * PANEL[0], 4.5)
-    lines = sum(label.count("\n") + 1 for label in wrapped(labels, width))
-    made = figure(width, rows * PANEL[1] + 0.25 * -(-lines // legend_columns(labels, width)) + 0.2)
+    made = figure(width, rows * PANEL[1] + legend_height(labels, width) + 0.2)
     axes = list(made.subplots(rows, columns, squeeze=False).flat)
     for unused in axes[count:]:
         unused.remove()
@@ -117,6 +116,12 @@ def legend_columns(labels: Sequence[str], width: float) -> int:
 def wrapped(labels: Sequence[str], width: float) -> list[str]:
     """Labels of as many lines as they need to be no wider than the figure."""
     return [textwrap.fill(label, int((width - HANDLE) / LETTER)) for label in labels]
+
+
+def legend_height(labels: Sequence[str], width: float) -> float:
+    """Inches that labels take in a figure so many inches wide."""
+    lines = sum(label.count("\n") + 1 for label in wrapped(labels, width))
+    return 0.25 * -(-lines // legend_columns(labels, width))
 
 
 def add_legend(made: Any, colour: dict[str, str], title: str, style: dict[str, Any] | None = None) -> None:

@@ -1,4 +1,4 @@
-"""Tell how well VRM's beliefs know CartPole's hidden state: `python docs/results/cartpole/knows.py RUN ...`.
+"""Tell how well VRM's beliefs know CartPole's hidden state: `python docs/results/beliefs/knows.py RUN ...`.
 
 Of each run 24 episodes are played with mode actions, and perceived twice: with the mean of every z, and with a sample
 of it. A linear map from the belief to the state (ridge regression) is fitted to 18 episodes and tried on the others.
@@ -6,9 +6,8 @@ of it. A linear map from the belief to the state (ridge regression) is fitted to
 
 import sys
 
-import jax
-import jax.numpy as jnp
 import numpy as np
+from probe import fit, perceiver
 
 from beliefrl.episodes import Player
 from beliefrl.evaluation import restore_seed
@@ -27,37 +26,13 @@ def play(agent, task, trained):
             yield steps, np.array([[float(leaf) for leaf in state] for state in player.environment.unwrapped.states])
 
 
-def perceiver(agent, task, trained):
-    """A function that gives what both models make of an episode, (time, belief), with samples of z or means."""
-
-    def perceive(memory, moment):
-        step, key, sampled = moment
-        _, memory = agent.act(trained, memory, step, key, sampled)
-        return memory, jnp.concatenate([perception(step), memory.first.d, memory.keep.d])
-
-    @jax.jit
-    def beliefs(steps, sampled):
-        time = len(steps.reward)
-        moments = steps, jax.random.split(jax.random.key(0), time), jnp.full(time, sampled)
-        return jax.lax.scan(perceive, agent.reset(task.spec), moments)[1]
-
-    def padded(steps, sampled):  # all episodes of one length: one compilation
-        missing = task.spec.max_steps + 1 - len(steps.reward)
-        longer = jax.tree.map(lambda leaf: np.pad(leaf, [(0, missing)] + [(0, 0)] * (leaf.ndim - 1)), steps)
-        return np.asarray(beliefs(longer, sampled), float)[: len(steps.reward)]
-
-    return padded
-
-
 def unknown(fitted, tried):
     """Root mean square of what a linear map, fitted to (inputs, states), does not tell of other states."""
     (inputs, states), (others, to_tell) = (
         [np.concatenate(part) for part in zip(*pairs, strict=True)] for pairs in (fitted, tried)
     )
-    mean, deviation = inputs.mean(0), inputs.std(0) + 1e-6
-    inputs, others = (np.c_[(each - mean) / deviation, np.ones(len(each))] for each in (inputs, others))
-    weights = np.linalg.solve(inputs.T @ inputs + PENALTY * np.eye(inputs.shape[1]), inputs.T @ states)
-    return np.sqrt(np.mean((to_tell - others @ weights) ** 2, 0))
+    tell_states = fit(inputs, states, PENALTY)
+    return np.sqrt(np.mean((to_tell - tell_states(others)) ** 2, 0))
 
 
 def tell(name, numbers):
