@@ -1,7 +1,7 @@
 """Train VRM on the pendulum that is seen by its speed only, and look at what came of it.
 
     pip install beliefrl
-    python examples/00_quick_start.py                           # 15,000 steps, three seeds: about 25 minutes
+    python examples/00_quick_start.py                           # 15,000 steps, three seeds: 15 to 25 minutes
     python examples/00_quick_start.py --steps 300 --seeds 1     # to see it run
 
 Random play gets a return of about -1200 an episode; -200 is a pendulum that is swung up and held.
