@@ -22,7 +22,7 @@ class UserError(Exception):
 LARGEST = 2**31 - 1  # integer in a compiled program
 
 
-def check_range(settings: Any, names: Sequence[str], low: float, high: float = LARGEST) -> None:
+def check_range(settings: Any, names: Sequence[str], low: int | float, high: int | float = LARGEST) -> None:
     """Raise a UserError where a field of a dataclass, or an entry of a tuple there, is no number in [low, high].
 
     A field that is declared as int takes whole numbers only; one that is declared as a tuple takes tuples of the

@@ -139,7 +139,7 @@ def _spaced(indices: tuple[int, ...]) -> str:
     return ", ".join(map(str, indices))
 
 
-def make(name: str, observe: Sequence[int | str] | str | None = None, **constants: Any) -> Any:
+def make(name: str, observe: Sequence[int | str] | int | str | None = None, **constants: Any) -> Any:
     """The task of that name.
 
     "pendulum-v" is pendulum with velocities only, "pendulum-p" (positions) without velocities. "gym:ID" is any
@@ -147,12 +147,12 @@ def make(name: str, observe: Sequence[int | str] | str | None = None, **constant
 
     Args:
         name: of the task.
-        observe: entries of the observation that the agent sees, in that order, or "velocities" or "positions" where the
+        observe: indices of the observation that the agent sees, in that order, or "velocities" or "positions" where the
             task says which they are; None is all.
         constants: replace the task's physical constants, or are gymnasium.make's arguments.
 
     Raises:
-        UserError: no task has that name, it has no such constant, or `observe` does not fit it.
+        UserError: no task has that name, it has no such constant, a value is impossible, or `observe` does not fit it.
     """
     task = _make(name, constants)
     return task if observe is None else _observed(task, _indices(name, observe))
@@ -188,7 +188,7 @@ def _observed(task: Any, indices: tuple[int, ...]) -> Any:
     return observe(task, indices)  # in `make` this word is an argument
 
 
-def _indices(name: str, observe: Sequence[int | str] | str) -> tuple[int, ...]:
+def _indices(name: str, observe: Sequence[int | str] | int | str) -> tuple[int, ...]:
     """What `observe` means for the task of that name."""
     given = [observe] if isinstance(observe, str | int) else list(observe)
     if len(given) == 1 and given[0] in MASKS.values():
