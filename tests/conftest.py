@@ -13,9 +13,16 @@ os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
 
 import jax
 import jaxtyping
+import pytest
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jaxtyping.install_import_hook("beliefrl", "beartype.beartype")  # before the first import of beliefrl
+
+
+@pytest.fixture
+def unchecked(monkeypatch):
+    """The types in our signatures are not checked, as in a user's program: a wrong one must be a UserError there."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
 def pytest_unconfigure():

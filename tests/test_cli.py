@@ -73,7 +73,7 @@ def complaint(capsys, argv):
 
 
 @pytest.mark.parametrize("line", MISTAKES)
-def test_a_mistake_ends_with_one_sentence(folders, capsys, line):
+def test_a_mistake_ends_with_one_sentence(folders, capsys, line, unchecked):
     before = sorted(folders.rglob("*"))
     assert MISTAKES[line] in complaint(capsys, line.split())
     assert sorted(folders.rglob("*")) == before

@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import functools
 import io
+import json
 import pathlib
 import re
 
@@ -13,6 +14,7 @@ import beliefrl
 from beliefrl import agents, tasks
 from beliefrl.cli import COMMANDS, main
 from beliefrl.tasks import registered
+from beliefrl.types import UserError
 
 ROOT = pathlib.Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -65,9 +67,9 @@ def test_the_command_lines_of_a_page_are_found():
     assert list(command_lines(page)) == [("train", "vrm", "ant", "--seeds", "2"), ("show", "RUN")]
 
 
-def rows(page):
-    """Of the tables of a page the rows that begin with a name: {name: the other cells}."""
-    lines = [line.split("|")[1:-1] for line in page.read_text().splitlines() if line.startswith("| `")]
+def rows(text):
+    """Of the tables of a page's text the rows that begin with a name: {name: the other cells}."""
+    lines = [line.split("|")[1:-1] for line in text.splitlines() if line.startswith("| `")]
     return {name.strip(" `"): [cell.strip() for cell in cells] for name, *cells in lines}
 
 
@@ -78,7 +80,8 @@ def entries(cell):
 
 
 def test_the_page_of_tasks_has_every_task_as_it_is():
-    table = rows(DOCS / "tasks.md")
+    table = rows((DOCS / "tasks.md").read_text())
+    table = {name: row for name, row in table.items() if not any(name in constants(task) for task in tasks.TASKS)}
     assert set(table) == {*tasks.names(), *registered.names()} - {registered.ANY}
     for name in tasks.names():
         _, numbers, actions, steps, indices = table[name]
@@ -96,11 +99,40 @@ def test_the_page_of_tasks_has_every_task_as_it_is():
         assert int(numbers) == len(known.velocities + known.positions)
 
 
-def test_the_page_of_tasks_has_every_constant():
-    text = (DOCS / "tasks.md").read_text()
-    for task in tasks.TASKS.values():
-        for constant in dataclasses.fields(task):
-            assert f"`{constant.name}`" in text
+HEADINGS = {"pendulum": "Pendulum", "cartpole": "CartPole", "target-reaching": "Sequential target reaching"}
+
+
+def constants(name):
+    """The table of a task's constants: {constant: (default, from, to)}, as the page writes them."""
+    section = (DOCS / "tasks.md").read_text().partition(f"## {HEADINGS[name]}\n")[2].partition("\n## ")[0]
+    return {constant: row[:3] for constant, row in rows(section).items()}
+
+
+@pytest.mark.parametrize("name", tasks.TASKS)
+def test_the_page_of_tasks_has_every_constant_and_its_default(name):
+    table = constants(name)
+    task = tasks.TASKS[name]()
+    assert list(table) == [field.name for field in dataclasses.fields(task)]
+    for constant, (default, _, _) in table.items():
+        assert json.loads(default) == pytest.approx(json.loads(json.dumps(getattr(task, constant))), rel=1e-4)
+
+
+@pytest.mark.parametrize(("name", "constant"), [(name, each) for name in tasks.TASKS for each in constants(name)])
+def test_the_ranges_on_the_page_of_tasks_are_those_of_the_code(name, constant, unchecked):
+    task, (_, low, high) = tasks.TASKS[name](), constants(name)[constant]
+    dependent = {"`field`": 15.0, "half of `target_square`²": 8.0}  # with the other constants' defaults
+    bounds = [(float(low), -1), *([(dependent.get(high) or float(high), 1)] if high else [])]
+
+    def value(number):
+        kind = type(getattr(task, constant))
+        return (number,) * 3 if kind is tuple else kind(number)
+
+    for bound, outwards in bounds:
+        beyond = bound + outwards * (1 if constant == "max_steps" else 1e-3 * abs(bound) or 1e-3)
+        if constant not in ("field", "target_square"):  # the ranges of others depend on these
+            tasks.make(name, **{constant: value(bound)})
+        with pytest.raises(UserError, match=f"^{constant}="):
+            tasks.make(name, **{constant: value(beyond)})
 
 
 def test_the_page_of_agents_has_every_agent():

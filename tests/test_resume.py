@@ -285,6 +285,16 @@ def test_a_disk_that_is_full_is_one_sentence(tmp_path):
     assert done.stderr.count("\n") == 1
 
 
+def test_constants_that_are_tuples_are_the_same_when_a_run_goes_on(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    line = "train sac-mlp target-reaching --steps 4 --eval-episodes 1 --constants max_steps=2 --out run --resume"
+    for _ in range(2):
+        main(line.split())
+    with pytest.raises(SystemExit):
+        main(line.replace("max_steps=2", "max_steps=2 rewards=[1,2,3]").split())
+    assert "run was trained with constants=" in capsys.readouterr().err
+
+
 def test_a_folder_that_cannot_be_locked_is_one_sentence(whole, tmp_path):
     (tmp_path / "lock").mkdir()
     (tmp_path / "config.json").write_bytes((whole[0] / "config.json").read_bytes())

@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)
+IMAGE = spaces.Box(0, 255, (64, 64, 3), np.uint8)
 
 
 class Fine(gymnasium.Env):
@@ -118,7 +119,18 @@ UNSUPPORTED = {  # what is made: a word of the sentence
     spaced(action_space=spaces.Box(0, 3, (1,), np.int32)): "real numbers",
     spaced(action_space=spaces.Box(-1.0, 1.0, (), np.float32)): "at least one number",
     spaced(action_space=None): "has the actions None",
-    spaced(observation_space=spaces.Box(0, 255, (64, 64, 3), np.uint8)): "images",
+    spaced(action_space=spaces.Box(np.array([-1.0, 0.5]), np.array([1.0, 0.5]), dtype=np.float64)): (
+        "an action that can only be 0.5, entry 1 of its Box"
+    ),
+    spaced(observation_space=IMAGE): "observes images",
+    spaced(observation_space=spaces.Dict({"arm": BOX, "camera": IMAGE})): "uint8) at ['camera'])",
+    spaced(observation_space=spaces.Tuple([BOX, spaces.Dict({"eye": IMAGE})])): "uint8) at [1]['eye'])",
+    spaced(observation_space=spaces.Text(20)): "has the observations Text",
+    spaced(observation_space=spaces.Dict({"arm": BOX, "word": spaces.Text(20)})): "at ['word']: what is supported",
+    spaced(observation_space=spaces.Tuple([BOX, spaces.Sequence(BOX)])): "at [1]: what is supported",
+    spaced(observation_space=spaces.Box(-1.0, 1.0, (5000,), np.float32)): "an observation of 5,000 numbers",
+    spaced(observation_space=spaces.Dict({"arm": BOX, "cell": spaces.Discrete(10**6)})): "of 1,000,002 numbers",
+    spaced(observation_space=spaces.Dict({})): "without numbers",
     spaced(observation_space=spaces.Graph(BOX, None)): "has the observations Graph",
     spaced(observation_space=spaces.Sequence(BOX)): "what flattens to one",
     spaced(observation_space=spaces.Box(-1.0, 1.0, (0,), np.float32)): "without numbers",
@@ -138,6 +150,8 @@ FAULTS = {  # what is made: (a phrase of the sentence, the step that it names)
     with_observation(np.array([0.0, np.nan])): ("entry 1 of the observation is nan", 3),
     with_observation(np.array([np.inf, 0.0])): ("entry 0 of the observation is inf", 3),
     with_observation(np.array([1e300, 0.0])): ("entry 0 of the observation is 1e+300", 3),
+    with_observation(np.array([0.0, -202.0])): ("entry 1 of the observation is -202.0, far outside its space", 3),
+    with_observation(np.array([1e6, 0.0])): ("which says -1.0 to 1.0: correct the observation", 3),
     with_observation(np.zeros(3)): ("the observation has shape (3,), where its space says (2,)", 3),
     with_observation(np.zeros((1, 2))): ("the observation has shape (1, 2)", 3),
     with_observation(0.5): ("the observation has shape ()", 3),

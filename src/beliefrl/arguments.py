@@ -60,6 +60,8 @@ def named_values(given: Sequence[str], option: str) -> dict[str, Any]:
         name, separator, value = each.partition("=")
         if not (separator and name.isidentifier()):
             raise UsageError(f"{option} {each} cannot be understood: write NAME=VALUE, such as max_episode_steps=500.")
+        if name in ("name", "observe"):  # arguments of `tasks.make` beside the constants
+            raise UsageError(f"{option} {each} is impossible: the task's name and --observe are given apart.")
         try:
             values[name] = json.loads({"True": "true", "False": "false", "None": "null"}.get(value, value))
         except ValueError:

@@ -15,7 +15,7 @@ from beliefrl.rollout import Episode
 from beliefrl.runs import Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import GymnasiumTask
-from beliefrl.types import LARGEST, UserError
+from beliefrl.types import LARGEST, UserError, tuples
 
 MODES = ("sampled", "mode")  # how actions are chosen; the first axis of an evaluation's leaves behind seeds
 MOST_EPISODES = 100_000  # side by side
@@ -93,11 +93,6 @@ def task_of(run: Run | str | os.PathLike[str]) -> Any:
     if not tasks.knows(name):
         raise UserError(f"{run.folder} was trained on {name}, which is not a task of this library: pass task=.")
     return tasks.make(name, run.config.get("observe"), **constants)
-
-
-def tuples(values: dict[str, Any]) -> dict[str, Any]:
-    """JSON's lists as the tuples they were."""
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
 
 
 def evaluate(

@@ -6,7 +6,8 @@ Axis names in shapes, everywhere: `seed` (one training each), `batch` (windows),
 
 import dataclasses
 import numbers
-from collections.abc import Sequence
+import typing
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -21,22 +22,50 @@ class UserError(Exception):
 LARGEST = 2**31 - 1  # integer in a compiled program
 
 
-def check_range(settings: Any, names: Sequence[str], low: int, high: int = LARGEST) -> None:
+def check_range(settings: Any, names: Sequence[str], low: int | float, high: int | float = LARGEST) -> None:
     """Raise a UserError where a field of a dataclass, or an entry of a tuple there, is no number in [low, high].
 
-    Where the field is declared as int, it must be a whole number. NaN is in no range.
+    A field that is declared as int takes whole numbers only; one that is declared as a tuple takes tuples of the
+    declared length only. NaN is in no range; True and False are no numbers.
     """
     declared = {field.name: field.type for field in dataclasses.fields(settings)}
     for name in names:
-        value = getattr(settings, name)
-        entries = value if isinstance(value, tuple) else (value,)
-        whole = declared[name] in (int, tuple[int, ...])
-        numeric = all(isinstance(entry, numbers.Integral if whole else numbers.Real) for entry in entries)
-        if not entries or not numeric or not all(low <= entry <= high for entry in entries):
+        value, kinds = getattr(settings, name), typing.get_args(declared[name]) or (declared[name],)
+        several = typing.get_origin(declared[name]) is tuple
+        count = len(kinds) if several and ... not in kinds else None
+        entries = value if several and isinstance(value, tuple) else (value,)
+        whole = int in kinds
+        numeric = all(_is_number(entry, whole) for entry in entries)
+        fits = isinstance(value, tuple) == several and len(entries) == (count or max(len(entries), 1))
+        if not fits or not numeric or not all(low <= entry <= high for entry in entries):
             too_large = numeric and any(entry > high for entry in entries)
             bounds = f"from {low} to {high}" if too_large or high < LARGEST else f"of at least {low}"
-            number = "a whole number" if whole else "a number"
-            raise UserError(f"{name}={value} is impossible: it must be {number} {bounds}.")
+            number = "whole number" if whole else "number"
+            what = f"{count or 'a tuple of'} {number}s" if several else f"a {number}"
+            raise UserError(f"{name}={value} is impossible: it must be {what} {bounds}.")
+
+
+def _is_number(value: Any, whole: bool) -> bool:
+    return isinstance(value, numbers.Integral if whole else numbers.Real) and not isinstance(value, bool)
+
+
+def check_indices(indices: Sequence[Any], size: int) -> None:
+    """Raise a UserError where `indices` are not different entries of an observation of `size` numbers, at least one."""
+    allowed = f"give indices from 0 to {size - 1}."
+    for position, index in enumerate(indices):
+        if not (_is_number(index, whole=True) and 0 <= index < size):
+            has = "1 entry" if size == 1 else f"{size} entries"
+            raise UserError(f"{index} is not an index of the observation, which has {has}: {allowed}")
+        if index in indices[:position]:
+            given = " ".join(map(str, indices))
+            raise UserError(f"observe={given} has the index {index} twice: give each index once.")
+    if not len(indices):
+        raise UserError(f"observe has no index: {allowed}")
+
+
+def tuples(values: Mapping[str, Any]) -> dict[str, Any]:
+    """JSON's lists as the tuples that they stand for."""
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
 
 
 def check_choice(settings: object, name: str, choices: Sequence[str]) -> None:

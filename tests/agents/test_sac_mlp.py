@@ -75,7 +75,13 @@ def test_standardised_it_does_not_matter_in_which_units_observations_are():
     assert np.abs(raw - actions[0]).max() > 0.05
 
 
-@pytest.mark.parametrize("wrong", [{"batch_size": 0}, {"pretrain_updates": -1}, {"gamma": 2.0}, {"policy_layers": ()}])
-def test_impossible_hyperparameters_are_refused(wrong):
+WRONG = [
+    *({"batch_size": 0}, {"batch_size": True}, {"pretrain_updates": -1}, {"gamma": 2.0}),
+    *({"policy_layers": ()}, {"policy_layers": 64}, {"policy_layers": [64, 64]}),
+]
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_impossible_hyperparameters_are_refused(wrong, unchecked):
     with pytest.raises(UserError, match=f"{next(iter(wrong))}="):
         SACMLPAgent(**wrong)

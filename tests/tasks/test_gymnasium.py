@@ -10,7 +10,7 @@ from beliefrl.lockstep import Lockstep
 from beliefrl.tasks import gymnasium as adapter
 from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
 from beliefrl.types import UserError
-from wrong import BOX, FAULTS, UNSUPPORTED, Dictionary, Fine
+from wrong import BOX, FAULTS, UNSUPPORTED, Dictionary, Fine, spaced
 
 
 def a_sentence(error):
@@ -87,12 +87,56 @@ def test_only_the_entries_observed_are_seen_in_their_order():
     np.testing.assert_array_equal(again.environment().reset(seed=3)[0], whole[[0]])
 
 
+@pytest.mark.parametrize(
+    ("indices", "phrase"),
+    [((2,), "2 is not an index of the observation, which has 2 entries"), ((1, 1), "twice"), ((), "has no index")],
+)
+def test_indices_of_a_task_of_your_own_are_checked(indices, phrase):
+    with pytest.raises(UserError, match=phrase):
+        _ = GymnasiumTask(Fine, indices=indices).spec
+
+
 def test_an_entry_that_is_not_seen_may_be_anything():
     class Broken(Fine):
         def observe(self):
             return np.array([np.nan, 0.5])
 
     np.testing.assert_allclose(GymnasiumTask(Broken, indices=(1,)).environment().reset(seed=0)[0], [0.5])
+
+
+@pytest.mark.parametrize(
+    ("space", "obs"),
+    [
+        (BOX, [-201.0, 201.0]),  # as far as a hundred widths
+        (spaces.Box(0.0, 1e-3, (2,), np.float32), [-100.0, 100.0]),  # a range of less than one counts as one
+        (spaces.Box(-np.inf, np.inf, (2,), np.float32), [-1e30, 1e30]),
+        (spaces.Box(0.0, np.inf, (2,), np.float32), [-1e30, 1e30]),
+        (spaces.Box(-3e38, 3e38, (2,), np.float32), [-3e38, 3e38]),
+    ],
+)
+def test_what_leaves_its_range_a_little_is_seen_as_it_is(space, obs):
+    make = spaced(observation_space=space, observe=lambda self: np.array(obs))
+    np.testing.assert_allclose(GymnasiumTask(make).environment().reset()[0], obs, rtol=1e-6)
+
+
+def test_the_range_of_an_entry_is_its_own_in_a_composite_observation():
+    space = spaces.Dict({"far": spaces.Box(-1e4, 1e4, (1,), np.float32), "near": BOX})
+
+    def observing(near):
+        return spaced(
+            observation_space=space, observe=lambda self: {"far": np.array([9e3]), "near": np.array([0.0, near])}
+        )
+
+    np.testing.assert_allclose(GymnasiumTask(observing(1.0)).environment().reset()[0], [9e3, 0.0, 1.0])
+    with pytest.raises(Fault, match=r"entry 2 of the observation is 9000\.0, far outside"):
+        GymnasiumTask(observing(9e3)).environment().reset()
+    GymnasiumTask(observing(9e3), indices=(0, 1)).environment().reset()  # what is not seen may be anything
+
+
+@pytest.mark.parametrize("limit", [0, -1, 1.5, "long", True])
+def test_an_impossible_time_limit_is_refused(limit, unchecked):
+    with pytest.raises(UserError, match=f"max_steps={limit} is impossible: it must be a whole number"):
+        GymnasiumTask(Fine, max_steps=limit)
 
 
 def test_a_time_limit_truncates_and_does_not_terminate():
@@ -142,6 +186,12 @@ def test_a_task_is_made_again_from_its_description(name, given):
 @pytest.mark.parametrize(
     ("name", "given", "phrase"),
     [
+        ("gym:Pendulum-v0", {}, "did you mean gym:Pendulum-v1?"),
+        ("gym:MountainCarContinous-v0", {}, "did you mean gym:MountainCarContinuous-v0?"),
+        ("MountainCarContinous-v0", {}, "did you mean gym:MountainCarContinuous-v0?"),
+        ("gym:Pendulum-v1", {"observe": [0, 2, 0]}, "observe=0 2 0 has the index 0 twice"),
+        ("gym:Pendulum-v1", {"observe": 99}, "99 is not an index of the observation, which has 3 entries"),
+        ("gym:Pendulum-v1", {"max_episode_steps": True}, "max_episode_steps=True is impossible"),
         ("gym:Nothing-v0", {}, "Gymnasium has no environment 'Nothing-v0'"),
         ("gym:", {}, "Gymnasium has no environment ''"),
         ("gym:no_such_module:Robot-v0", {}, "no_such_module"),

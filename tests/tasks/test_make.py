@@ -1,11 +1,16 @@
 """Tasks by name: their sizes, their masks, the errors of a user, and what every task keeps to."""
 
+import dataclasses
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from beliefrl.tasks import make, names, observe
+from beliefrl.tasks import TASKS, make, names, observe
+from beliefrl.tasks.pendulum import Pendulum
+from beliefrl.tasks.target_reaching import TargetReaching
 from beliefrl.types import UserError
 
 SIZES = {  # obs_dim, action_dim, max_steps, has_success
@@ -53,10 +58,20 @@ def test_observe_keeps_the_order_that_was_asked_for():
     assert some.spec == task.spec._replace(obs_dim=3)
 
 
-@pytest.mark.parametrize("indices", [(), (3,), (0, -1)])
-def test_observe_refuses_entries_that_are_not_there(indices):
+@pytest.mark.parametrize("indices", [(), (3,), (0, -1), (1.5,), (True,), ("1",), (10**30,)])
+def test_observe_refuses_entries_that_are_not_there(indices, unchecked):
     with pytest.raises(UserError, match="indices from 0 to 2"):
         observe(make("pendulum"), indices)
+
+
+def test_observe_refuses_the_same_entry_twice():
+    with pytest.raises(UserError, match="observe=2 0 2 has the index 2 twice"):
+        observe(make("pendulum"), (2, 0, 2))
+
+
+def test_observe_does_not_round(unchecked):
+    with pytest.raises(UserError, match=r"observe=1\.5 cannot be understood"):
+        make("pendulum", observe=[1.5])
 
 
 @pytest.mark.parametrize(
@@ -86,6 +101,51 @@ def test_an_unknown_constant_is_refused_with_those_there_are(name):
 @pytest.mark.parametrize("name", ["pendulum", "pendulum-v"])
 def test_constants_are_replaced(name):
     assert make(name, max_steps=50).spec.max_steps == 50
+
+
+CONSTANTS = [(name, field) for name, task in TASKS.items() for field in dataclasses.fields(task)]
+
+
+@pytest.mark.parametrize(("name", "field"), CONSTANTS, ids=lambda each: getattr(each, "name", each))
+def test_a_constant_is_a_finite_number(name, field, unchecked):
+    sentence = f"^{field.name}=.* is impossible: it must be .*number.* (from|of at least) "
+    for value in ("abc", "nan", math.nan, math.inf, -math.inf, True, None, [], {}, 10**12, -(10**12)):
+        with pytest.raises(UserError, match=sentence):
+            make(name, **{field.name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "constants"),
+    [
+        ("pendulum", {"dt": 0}),
+        ("pendulum-v", {"mass": -1}),
+        ("pendulum", {"max_steps": 1.5}),
+        ("pendulum", {"max_steps": 0}),
+        ("cartpole", {"max_theta": 0.04}),  # it could begin beyond it
+        ("target-reaching", {"rewards": [1, 2]}),
+        ("target-reaching", {"rewards": [1, 2, "many"]}),
+        ("target-reaching", {"rewards": 5}),
+        ("target-reaching", {"target_square": 16}),  # larger than the field
+        ("target-reaching", {"min_squared_gap": 8.1}),  # no three points in the square are so far apart
+    ],
+)
+def test_a_constant_out_of_its_range_is_refused(name, constants, unchecked):
+    (constant,) = constants
+    with pytest.raises(UserError, match=f"^{constant}=.* is impossible"):
+        make(name, **constants)
+
+
+def test_constants_are_checked_where_the_class_is_used(unchecked):
+    with pytest.raises(UserError, match=r"^mass=abc is impossible"):
+        Pendulum(mass="abc")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(UserError, match=r"^mass=0 is impossible"):
+        dataclasses.replace(Pendulum(), mass=0)
+
+
+def test_a_list_of_rewards_is_a_tuple_of_the_task(unchecked):
+    task = make("target-reaching", rewards=[1, 2, 3])
+    assert task.rewards == (1, 2, 3)
+    assert hash(task) == hash(TargetReaching(rewards=(1, 2, 3)))
 
 
 @pytest.mark.parametrize("name", SIZES)

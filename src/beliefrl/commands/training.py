@@ -1,6 +1,7 @@
 """`beliefrl train` and `beliefrl resume`."""
 
 import dataclasses
+import json
 import pathlib
 from collections.abc import Sequence
 from typing import Annotated, Any
@@ -108,9 +109,9 @@ def _same_training(run: Any, agent: str, task: dict[str, Any], options: Any) -> 
     from beliefrl.types import UserError
 
     asked = {"agent": agent, **task, **dataclasses.asdict(options.training), **dataclasses.asdict(options.agent)}
+    asked = json.loads(json.dumps(asked))  # tuples, also those among the constants, are lists in the run's config
     there = {**run.config, **run.config["options"], **run.config["hyperparameters"], "steps": options.training.steps}
     for name, value in asked.items():
-        value = list(value) if isinstance(value, tuple) else value
         if there.get(name, value) != value:
             raise UserError(f"{run.folder} was trained with {name}={there[name]}, not {value}: choose another --out.")
 

@@ -13,7 +13,7 @@ from beliefrl.tasks.cartpole import CartPole
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.pendulum import Pendulum
 from beliefrl.tasks.target_reaching import TargetReaching
-from beliefrl.types import Spec, UserError
+from beliefrl.types import Spec, UserError, check_indices, tuples
 
 
 @runtime_checkable
@@ -76,13 +76,10 @@ def observe(task: Any, indices: tuple[int, ...]) -> Any:
     """The same task of which only the entries `indices` of the observation are seen.
 
     Raises:
-        UserError: an index outside the observation, or none at all.
+        UserError: an index outside the observation, the same one twice, or none at all.
     """
     size = task.spec.obs_dim
-    if not indices or any(not 0 <= i < size for i in indices):
-        raise UserError(
-            f"observe={tuple(indices)} does not fit an observation of {size}: give indices from 0 to {size - 1}."
-        )
+    check_indices(indices, size)
     if isinstance(task, GymnasiumTask):
         seen = range(size) if task.indices is None else task.indices
         return dataclasses.replace(task, indices=tuple(seen[i] for i in indices))
@@ -142,7 +139,7 @@ def _spaced(indices: tuple[int, ...]) -> str:
     return ", ".join(map(str, indices))
 
 
-def make(name: str, observe: Sequence[int | str] | str | None = None, **constants: Any) -> Any:
+def make(name: str, observe: Sequence[int | str] | int | str | None = None, **constants: Any) -> Any:
     """The task of that name.
 
     "pendulum-v" is pendulum with velocities only, "pendulum-p" (positions) without velocities. "gym:ID" is any
@@ -150,12 +147,12 @@ def make(name: str, observe: Sequence[int | str] | str | None = None, **constant
 
     Args:
         name: of the task.
-        observe: entries of the observation that the agent sees, in that order, or "velocities" or "positions" where the
+        observe: indices of the observation that the agent sees, in that order, or "velocities" or "positions" where the
             task says which they are; None is all.
         constants: replace the task's physical constants, or are gymnasium.make's arguments.
 
     Raises:
-        UserError: no task has that name, it has no such constant, or `observe` does not fit it.
+        UserError: no task has that name, it has no such constant, a value is impossible, or `observe` does not fit it.
     """
     task = _make(name, constants)
     return task if observe is None else _observed(task, _indices(name, observe))
@@ -164,10 +161,9 @@ def make(name: str, observe: Sequence[int | str] | str | None = None, **constant
 def _make(name: str, constants: dict[str, Any]) -> Any:
     if name.startswith(registered.PREFIX):
         return registered.make(name.removeprefix(registered.PREFIX), constants)
-    known = names()
-    if name not in known:
-        near = difflib.get_close_matches(name, known, n=1)
-        hint = f"did you mean {near[0]}?" if near else "`beliefrl tasks` lists them all."
+    if name not in names():
+        near = _similar(name)
+        hint = f"did you mean {near}?" if near else "`beliefrl tasks` lists them all."
         raise UserError(f"There is no task {name!r}: {hint}")
     base, mask = (name[:-2], MASKS[name[-2:]]) if name[-2:] in MASKS else (name, None)
     if base in registered.ROBOTS:
@@ -178,17 +174,23 @@ def _make(name: str, constants: dict[str, Any]) -> Any:
     for constant in constants:
         if constant not in fields:
             raise UserError(f"The task {base} has no constant {constant!r}: it has {', '.join(fields)}.")
-    task = TASKS[base](**constants)
+    task = TASKS[base](**tuples(constants))
     return task if mask is None else Observed(task, getattr(task, mask.upper()))
+
+
+def _similar(name: str) -> str | None:
+    """The task whose name is most like this one, which may be a Gymnasium id without its prefix."""
+    near = difflib.get_close_matches(name, names(), n=1)
+    return near[0] if near and name not in registered.ids() else registered.similar(name)
 
 
 def _observed(task: Any, indices: tuple[int, ...]) -> Any:
     return observe(task, indices)  # in `make` this word is an argument
 
 
-def _indices(name: str, observe: Sequence[int | str] | str) -> tuple[int, ...]:
+def _indices(name: str, observe: Sequence[int | str] | int | str) -> tuple[int, ...]:
     """What `observe` means for the task of that name."""
-    given = [observe] if isinstance(observe, str) else list(observe)
+    given = [observe] if isinstance(observe, str | int) else list(observe)
     if len(given) == 1 and given[0] in MASKS.values():
         of = registered.KNOWN.get(name.removeprefix(registered.PREFIX), registered.ROBOTS.get(name, TASKS.get(name)))
         velocities, positions = masks(of)
@@ -196,7 +198,7 @@ def _indices(name: str, observe: Sequence[int | str] | str) -> tuple[int, ...]:
             raise UserError(f"{name} does not say which of its observations are {given[0]}: give their indices.")
         return velocities if given[0] == "velocities" else positions
     try:
-        return tuple(int(entry) for entry in given)
+        return tuple(int(str(entry)) for entry in given)  # int(1.5) is 1
     except ValueError:
         raise UserError(
             f"observe={' '.join(map(str, given))} cannot be understood: give indices, or velocities, or positions."

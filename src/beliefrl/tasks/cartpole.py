@@ -15,7 +15,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.drawing import BLUE, GREY, INK, PALE, RED, Circle, Line, Picture, Polygon
-from beliefrl.types import Spec
+from beliefrl.types import Spec, check_range
+
+START = 0.05  # an episode begins with all four numbers in [-START, START]
 
 
 class CartPoleState(NamedTuple):
@@ -29,25 +31,43 @@ class CartPoleState(NamedTuple):
 class CartPole:
     """Keep a pole upright on a cart that stays on its track: x, ẋ, θ, θ̇; 1 action; 1000 steps."""
 
-    gravity: float = 9.8  # m/s²
-    cart_mass: float = 1.0  # kg
-    pole_mass: float = 0.1  # kg
-    half_length: float = 0.5  # m, from the hinge to the pole's centre of mass
-    force: float = 30.0  # N, at action 1
-    dt: float = 0.02  # s
-    max_x: float = 2.4  # m; beyond it the episode terminates
-    max_theta: float = math.radians(12.0)  # rad; likewise
+    gravity: float = 9.8
+    """m/s²."""
+    cart_mass: float = 1.0
+    """kg."""
+    pole_mass: float = 0.1
+    """kg."""
+    half_length: float = 0.5
+    """m, from the hinge to the pole's centre of mass."""
+    force: float = 30.0
+    """N, at action 1."""
+    dt: float = 0.02
+    """s, the length of a step."""
+    max_x: float = 2.4
+    """m, beyond which the episode terminates."""
+    max_theta: float = math.radians(12.0)
+    """rad, beyond which the episode terminates."""
     max_steps: int = 1000
+    """Time limit in steps."""
 
     VELOCITIES: ClassVar[tuple[int, ...]] = (1, 3)
     POSITIONS: ClassVar[tuple[int, ...]] = (0, 2)
+
+    def __post_init__(self) -> None:
+        """Refuse impossible values with a UserError."""
+        check_range(self, ("cart_mass", "pole_mass", "half_length", "force"), 0.001, 1000)
+        check_range(self, ("gravity",), 0, 1000)
+        check_range(self, ("dt",), 0.0001, 1)
+        check_range(self, ("max_x",), START, 1000)
+        check_range(self, ("max_theta",), START, 3)  # less than half a turn
+        check_range(self, ("max_steps",), 1)
 
     @property
     def spec(self) -> Spec:
         return Spec(obs_dim=4, action_dim=1, max_steps=self.max_steps)
 
     def reset(self, key: Key[Array, ""]) -> tuple[CartPoleState, Float[Array, "4"]]:
-        obs = jax.random.uniform(key, (4,), minval=-0.05, maxval=0.05)
+        obs = jax.random.uniform(key, (4,), minval=-START, maxval=START)
         return CartPoleState(*obs), obs
 
     def step(

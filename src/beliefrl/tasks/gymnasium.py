@@ -13,7 +13,8 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from beliefrl.types import LARGEST, Spec, UserError
+from beliefrl.tasks.spaces import check_actions, flat_bounds, flat_size, limits, short
+from beliefrl.types import LARGEST, Spec, UserError, check_indices, check_range
 
 ENDLESS = 10_000  # steps after which an episode without a time limit is taken for one that never ends
 
@@ -44,7 +45,9 @@ class GymnasiumTask:
     """Whether its info says `is_success` or `success`, so that rates of it are logged."""
 
     def __post_init__(self) -> None:
-        """Name it."""
+        """Name it, and refuse an impossible time limit with a UserError."""
+        if self.max_steps is not None:
+            check_range(self, ("max_steps",), 1)
         if not self.name:
             object.__setattr__(self, "name", getattr(self.make, "__qualname__", type(self.make).__name__))
 
@@ -87,34 +90,16 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
             raise UserError(f"{task.name} cannot be made: {said(error)}.") from None
         self.inner_action_space: Any = getattr(self.inner, "action_space", None)
         self.inner_observation_space: Any = getattr(self.inner, "observation_space", None)
-        self._check_actions(self.inner_action_space)
-        size = flat_size(self.inner_observation_space, task.name)
-        self.indices = np.arange(size) if task.indices is None else np.array(task.indices)
-        if self.indices.size == 0 or not np.all((self.indices >= 0) & (self.indices < size)):
-            raise UserError(
-                f"observe={task.indices} does not fit the observation of {task.name}, which has {size} numbers: "
-                f"give indices from 0 to {size - 1}."
-            )
+        check_actions(self.inner_action_space, task.name)
+        self._size = flat_size(self.inner_observation_space, task.name)
+        if task.indices is not None:
+            check_indices(task.indices, self._size)
+        self.indices = np.arange(self._size) if task.indices is None else np.array(task.indices)
+        self._lowest, self._highest = limits(self.inner_observation_space, self.indices)
         self.observation_space = spaces.Box(-np.inf, np.inf, (self.indices.size,), np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (self.inner_action_space.low.size,), np.float32)
         registered = getattr(self.inner, "spec", None)
         self.limit = task.max_steps or (registered.max_episode_steps if registered else None)
-
-    def _check_actions(self, space: Any) -> None:
-        name = self.task.name
-        if not isinstance(space, spaces.Box):
-            raise UserError(
-                f"{name} has the actions {_short(space)}: what is supported is a bounded Box of real numbers "
-                "(continuous control), not discrete or composite actions."
-            )
-        if not np.issubdtype(space.dtype, np.floating):
-            raise UserError(f"{name} has actions of type {space.dtype}: what is supported is a Box of real numbers.")
-        if space.shape == () or 0 in space.shape:
-            raise UserError(f"{name} has actions of shape {space.shape}: there must be at least one number in a row.")
-        if not space.is_bounded():
-            raise UserError(
-                f"{name} has unbounded actions: [-1, 1] is scaled to the bounds, so give its Box finite ones."
-            )
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -167,7 +152,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         space = self.inner.action_space
         if space is not self.inner_action_space and space != self.inner_action_space:
             raise self._fault(
-                f"its action space changed from {_short(self.inner_action_space)} to {_short(space)}, which must stay"
+                f"its action space changed from {short(self.inner_action_space)} to {short(space)}, which must stay"
             )
         return result
 
@@ -191,14 +176,22 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
             try:
                 value = np.asarray(spaces.flatten(space, obs))
             except Exception:
-                raise self._fault(f"the observation does not fit its space {_short(space)}") from None
-            if value.shape != (flat_size(space, self.task.name),):
-                raise self._fault(f"the observation does not fit its space {_short(space)}")
+                raise self._fault(f"the observation does not fit its space {short(space)}") from None
+            if value.shape != (self._size,):
+                raise self._fault(f"the observation does not fit its space {short(space)}")
         with np.errstate(over="ignore"):
             flat = value.reshape(-1)[self.indices].astype(np.float32)
         if not np.isfinite(flat).all():
             entry = int(self.indices[~np.isfinite(flat)][0])
             raise self._fault(f"entry {entry} of the observation is {value.reshape(-1)[entry]}")
+        far = (flat < self._lowest) | (flat > self._highest)
+        if far.any():
+            entry = int(self.indices[far][0])
+            bounds = flat_bounds(space)
+            raise self._fault(
+                f"entry {entry} of the observation is {value.reshape(-1)[entry]}, far outside its space, which says "
+                f"{bounds.low[entry]} to {bounds.high[entry]}: correct the observation, or its space"
+            )
         return flat
 
     def _number(self, reward: Any) -> float:
@@ -213,33 +206,8 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def _flag(self, value: Any, name: str) -> bool:
         if not isinstance(value, bool | np.bool_ | int | np.integer) or value not in (0, 1):
-            raise self._fault(f"{name} is {_short(value)}, where it must be True or False")
+            raise self._fault(f"{name} is {short(value)}, where it must be True or False")
         return bool(value)
-
-
-def flat_size(space: Any, name: str) -> int:
-    """Numbers in an observation of that space when flat.
-
-    Raises:
-        UserError: images, or what does not flatten to a fixed number of them.
-    """
-    if isinstance(space, spaces.Box) and len(space.shape) >= 2 and (space.dtype == np.uint8 or len(space.shape) > 2):
-        raise UserError(
-            f"{name} observes images ({_short(space)}): what is supported are vectors of numbers, such as a robot's "
-            "sensors."
-        )
-    try:
-        if not space.is_np_flattenable:
-            raise ValueError
-        size = spaces.flatdim(space)
-    except (AttributeError, NotImplementedError, ValueError):
-        raise UserError(
-            f"{name} has the observations {_short(space)}: what is supported is a Box, or what flattens to one "
-            "(Discrete, MultiBinary, Dict, Tuple of these)."
-        ) from None
-    if size == 0:
-        raise UserError(f"{name} has an observation without numbers ({_short(space)}): there must be at least one.")
-    return size
 
 
 def success_of(info: Any) -> bool:
@@ -258,8 +226,3 @@ def said(error: BaseException) -> str:
     """An exception on one line."""
     text = " ".join(str(error).split())[:300].rstrip(".")
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
-
-
-def _short(value: Any) -> str:
-    text = " ".join(repr(value).split())
-    return text if len(text) <= 80 else f"{text[:77]}..."

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.drawing import BLUE, INK, PALE, Circle, Line, Picture
-from beliefrl.types import Spec
+from beliefrl.types import Spec, check_range
 
 
 class PendulumState(NamedTuple):
@@ -26,16 +26,30 @@ class PendulumState(NamedTuple):
 class Pendulum:
     """Swing a pendulum up and hold it: cos θ, sin θ, θ̇; 1 action; 200 steps."""
 
-    gravity: float = 10.0  # m/s²
-    mass: float = 1.0  # kg
-    length: float = 1.0  # m
-    max_torque: float = 2.0  # N m, at action 1
-    max_speed: float = 8.0  # rad/s
-    dt: float = 0.05  # s
+    gravity: float = 10.0
+    """m/s²."""
+    mass: float = 1.0
+    """kg."""
+    length: float = 1.0
+    """m."""
+    max_torque: float = 2.0
+    """N m, at action 1."""
+    max_speed: float = 8.0
+    """rad/s, to which the speed is clipped."""
+    dt: float = 0.05
+    """s, the length of a step."""
     max_steps: int = 200
+    """Time limit in steps."""
 
     VELOCITIES: ClassVar[tuple[int, ...]] = (2,)
     POSITIONS: ClassVar[tuple[int, ...]] = (0, 1)
+
+    def __post_init__(self) -> None:
+        """Refuse impossible values with a UserError."""
+        check_range(self, ("mass", "length", "max_torque", "max_speed"), 0.001, 1000)
+        check_range(self, ("gravity",), 0, 1000)
+        check_range(self, ("dt",), 0.0001, 1)
+        check_range(self, ("max_steps",), 1)
 
     @property
     def spec(self) -> Spec:

@@ -8,6 +8,7 @@ classic ones are Gymnasium's own.
 import contextlib
 import ctypes
 import dataclasses
+import difflib
 import importlib
 import os
 import pathlib
@@ -84,6 +85,18 @@ def names() -> dict[str, str]:
     return listed
 
 
+def ids() -> list[str]:
+    """The ids that Gymnasium knows by itself, without those of this library, whose tasks have names of their own."""
+    return [id for id in gymnasium.registry if not id.startswith("BeliefRL/")]
+
+
+def similar(id: str) -> str | None:
+    """The task whose Gymnasium id, `Id` or `package:Id`, is most like this one; of several versions the newest."""
+    package, colon, name = id.rpartition(":")
+    near = difflib.get_close_matches(name, ids(), n=1, cutoff=0.8)
+    return f"{PREFIX}{package}{colon}{near[0]}" if near else None
+
+
 def make(id: str, arguments: dict[str, Any], name: str | None = None) -> GymnasiumTask:
     """The task of a Gymnasium id, `Id` or `package:Id`, which imports the package that registers it.
 
@@ -100,12 +113,11 @@ def make(id: str, arguments: dict[str, Any], name: str | None = None) -> Gymnasi
     try:
         gymnasium.spec(id.rpartition(":")[2])
     except error.Error as found:
-        raise UserError(
-            f"Gymnasium has no environment {id!r} ({_first_sentence(found)}): an environment of another package is "
-            "named gym:PACKAGE:ID."
-        ) from None
+        near = similar(id)
+        hint = f"did you mean {near}?" if near else "an environment of another package is named gym:PACKAGE:ID."
+        raise UserError(f"Gymnasium has no environment {id!r} ({_first_sentence(found)}): {hint}") from None
     limit = arguments.get("max_episode_steps")
-    if limit is not None and not (isinstance(limit, int) and limit >= 1):
+    if limit is not None and (isinstance(limit, bool) or not (isinstance(limit, int) and limit >= 1)):
         raise UserError(f"max_episode_steps={limit} is impossible: it must be a whole number of at least 1.")
     return GymnasiumTask(_Registered(id), name, dict(arguments))
 

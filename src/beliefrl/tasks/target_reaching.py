@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from beliefrl.drawing import BLUE, GREEN, GREY, INK, PALE, PAPER, RED, Circle, Line, Picture, Polygon
-from beliefrl.types import Spec
+from beliefrl.types import Spec, check_range
 
 
 class TargetReachingState(NamedTuple):
@@ -39,16 +39,34 @@ def wall_distance(position: Float[Array, "2"], heading: Float[Array, ""], field:
 class TargetReaching:
     """Reach three targets in a hidden order (long-term memory): 12 numbers; 2 actions; 128 steps."""
 
-    field: float = 15.0  # side of the field
-    target_square: float = 4.0  # side of the square in its middle where targets lie
-    min_squared_gap: float = 2.0  # every two targets are further apart than this, squared
-    radius: float = 0.4  # a target is reached within this distance
-    speed: float = 0.8  # distance a step at full speed of both wheels
-    axle: float = 0.5  # distance of the wheels: full opposite speeds turn 1 / axle rad a step
-    rewards: tuple[float, float, float] = (20.0, 50.0, 100.0)  # K of the first, second and third target
+    field: float = 15.0
+    """Side of the field."""
+    target_square: float = 4.0
+    """Side of the square in the middle of the field where targets lie."""
+    min_squared_gap: float = 2.0
+    """Every two targets are further apart than this, squared."""
+    radius: float = 0.4
+    """A target is reached within this distance."""
+    speed: float = 0.8
+    """Distance in a step at full speed of both wheels."""
+    axle: float = 0.5
+    """Distance of the wheels: full opposite speeds turn by 1 / axle rad in a step."""
+    rewards: tuple[float, float, float] = (20.0, 50.0, 100.0)
+    """K of the first, second and third target."""
     wall_reward: float = -0.1
-    scale: float = 3.0  # distances d are seen as exp(-d / scale)
+    """Reward of a step that would leave the field."""
+    scale: float = 3.0
+    """Distances d are seen as exp(-d / scale)."""
     max_steps: int = 128
+    """Time limit in steps."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible values with a UserError."""
+        check_range(self, ("field", "radius", "speed", "axle", "scale"), 0.001, 1000)
+        check_range(self, ("target_square",), 0.001, self.field)
+        check_range(self, ("min_squared_gap",), 0, self.target_square**2 / 2)  # else targets are redrawn for ever
+        check_range(self, ("rewards", "wall_reward"), -1000, 1000)
+        check_range(self, ("max_steps",), 1)
 
     @property
     def spec(self) -> Spec:
