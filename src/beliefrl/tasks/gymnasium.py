@@ -13,7 +13,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from beliefrl.types import LARGEST, Spec, UserError
+from beliefrl.types import LARGEST, Spec, UserError, one_line, said
 
 ENDLESS = 10_000  # steps after which an episode without a time limit is taken for one that never ends
 
@@ -254,12 +254,6 @@ def _array(value: Any) -> np.ndarray:
         return np.empty(0, object)
 
 
-def said(error: BaseException) -> str:
-    """An exception on one line."""
-    text = " ".join(str(error).split())[:300].rstrip(".")
-    return f"{type(error).__name__}: {text}" if text else type(error).__name__
-
-
 def _short(value: Any) -> str:
-    text = " ".join(repr(value).split())
+    text = one_line(repr(value))
     return text if len(text) <= 80 else f"{text[:77]}..."
