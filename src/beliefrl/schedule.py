@@ -124,6 +124,7 @@ def stages(
     keys = jax.vmap(jax.random.key)(np.array(numbers))
     try:
         if restore is None:
+            yield Event("compiling the agent", 0)
             start = Snapshot(Progress(), program.begin(keys))
         else:
             at, seeds = restore(program.shapes(keys))

@@ -101,13 +101,14 @@ def resume(
             are too few.
         Stopped: Ctrl-C or SIGTERM, once a checkpoint is written.
     """
-    folder = (run if isinstance(run, Run) else Run(run)).folder
+    run = run if isinstance(run, Run) else Run(run)
+    folder, agent = run.folder, agent_of(run)
     begins_again = not was_ever_written(folder) and not (folder / "results.json").exists()
     if not (begins_again or listed(folder)):
         raise UserError(f"{folder} has no checkpoint to go on from any more: train again, with another --out.")
     with contextlib.ExitStack() as stack:
         recorder = stack.enter_context(Recorder(folder, None))
-        agent, made = agent_of(recorder), task_of(recorder) if task is None else task
+        made = task_of(recorder) if task is None else task
         before = _options(recorder)
         if steps is not None and steps < before["steps"]:
             raise UserError(f"steps={steps} is impossible: {folder} trains for {before['steps']}, and may only grow.")

@@ -31,7 +31,7 @@ def one_line(text: str) -> str:
     return "".join(character for character in text if character.isprintable())
 
 
-ESCAPES = re.compile(r"\x1b\[[0-?]*[ -/]*[@-~]|\x1b\].*?(?:\x07|\x1b\\)", re.DOTALL)  # colours, titles, links
+ESCAPES = re.compile(r"(?:\x1b\[|\x9b)[0-?]*[ -/]*[@-~]|\x1b\].*?(?:\x07|\x1b\\)", re.DOTALL)  # colours, titles, links
 LARGEST = 2**31 - 1  # integer in a compiled program
 
 
