@@ -20,6 +20,9 @@ MISTAKES = {
     f"{TRAIN} --steps": "--steps needs a value",
     f"{TRAIN} --steps many": "--steps must be a whole number, not 'many'",
     f"{TRAIN} --steps 1.5": "--steps must be a whole number, not '1.5'",
+    f"{TRAIN} --steps 1.5e0": "--steps must be a whole number, not '1.5e0'",
+    f"{TRAIN} --steps inf": "--steps must be a whole number, not 'inf'",
+    f"{TRAIN} --processes sometimes": "--processes must be one of 'auto', 'always', 'never', not 'sometimes'",
     f"{TRAIN} --steps -5": "steps=-5 is impossible",
     f"{TRAIN} --steps 99999999999999999999": "steps=99999999999999999999 is impossible",
     f"{TRAIN} --seeds 0": "seeds=0 is impossible: it must be a whole number from 1",
@@ -107,7 +110,7 @@ MISTAKES = {
     "predict untrained": "untrained has no trained agent yet",
     "predict untrained --seed 3": "untrained has no seed 3: it has 0",
     "predict untrained --start 0": "start=0 is impossible",
-    "predict untrained --start many": "--start cannot be 'many'",
+    "predict untrained --start many": "--start must be a whole number, not 'many'",
     "predict untrained --horizon 0": "horizon=0 is impossible",
     "predict untrained --samples 9999999": "samples=9999999 is impossible",
     "predict untrained --episode-seed -1": "episode_seed=-1 is impossible",
@@ -137,7 +140,6 @@ MISTAKES = {
     f"{TRAIN} --checkpoint-steps -1": "checkpoint_steps=-1 is impossible",
     f"{TRAIN} --checkpoint-minutes nan": "checkpoint_minutes=nan is impossible",
     f"{TRAIN} --keep-checkpoints 0": "keep_checkpoints=0 is impossible",
-    f"{TRAIN} --processes sometimes": "processes='sometimes' is impossible: it must be auto or always or never",
     f"{TRAIN} --observe 1": "give indices from 0 to 0",
     f"{TRAIN} --observe -1": "-1 is not an index of the observation, which has 1 entry",
     f"{TRAIN} --observe velocities": "does not say which of its observations are velocities",
@@ -183,11 +185,11 @@ MISTAKES = {
     "resume missing": "no run folder missing",
     "resume there": "there is not a run",
     "resume broken": "broken/config.json cannot be read",
-    "resume untrained": "untrained has no checkpoint to go on from",
-    "resume untrained --steps many": "--steps cannot be 'many'",
+    "resume resultless": "resultless has no checkpoint to go on from any more: train again, with another --out",
+    "resume untrained --steps many": "--steps must be a whole number, not 'many'",
     "resume untrained extra": "one argument too many, 'extra'",
-    "resume halved": "halved has no checkpoint to go on from",
-    "resume foreign": "no checkpoint to go on from",
+    "resume damaged": "damaged has no checkpoint to go on from any more",
+    "resume foreign": "no agent 'foreign'",
     "show": "RUN is missing",
     "show missing": "no run folder missing",
     "show broken": "broken/config.json cannot be read",
@@ -230,12 +232,12 @@ def prepare(folder):
         "unknown": json.dumps(config | {"task": "nowhere"}),
         "overset": json.dumps(config | {"hyperparameters": {"colour": 1}}),
         "masked": json.dumps(config | {"observe": [5]}),
-    } | dict.fromkeys(("untrained", "damaged", "halved", "scribbled", "resultless"), whole)
+    } | dict.fromkeys(("untrained", "damaged", "scribbled", "resultless"), whole)
     for name, content in contents.items():
         (folder / name / "metrics").mkdir(parents=True)
         (folder / name / "config.json").write_text(content)
     (folder / "damaged" / "agent.safetensors").write_bytes(b"nonsense")
-    (folder / "halved" / "checkpoints" / ".000001-step-10.tmp").mkdir(parents=True)
+    (folder / "damaged" / "checkpoints" / "damaged-000001-step-10").mkdir(parents=True)
     (folder / "scribbled" / "metrics" / "seed-0.jsonl").write_text('{"step": 1, "kind": "update"}\nhello\n')
     (folder / "resultless" / "results.json").write_text('{"step": 10')
     (folder / "there").mkdir()

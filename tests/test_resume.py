@@ -4,8 +4,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import threading
 
 import jax.numpy as jnp
@@ -21,7 +19,7 @@ from beliefrl.runs import Recorder, Run
 from beliefrl.stop import Stopped
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.types import UserError
-from wrong import Fine
+from wrong import Fine, Raising
 
 SIZES = {"policy_layers": (8,), "value_layers": (8,), "batch_size": 8, "standardise": True}
 AGENT = agents.make("sac-mlp", step_start_rl=20, pretrain_updates=150, **SIZES)
@@ -77,17 +75,34 @@ LINE += " --checkpoint-steps 1 --resume --out"
 
 
 @pytest.mark.parametrize(
-    "left", ["its log", *(pytest.param(left, marks=pytest.mark.slow) for left in ("an empty log", "no config"))]
+    ("command", "left"),
+    [
+        ("resume", "a log and half a checkpoint"),
+        ("train --resume", "a log"),
+        pytest.param("train --resume", "no config", marks=pytest.mark.slow),
+        pytest.param("train", "a log", marks=pytest.mark.slow),
+        pytest.param("python", "a log", marks=pytest.mark.slow),
+    ],
 )
-def test_a_training_that_was_killed_before_its_first_checkpoint_begins_anew(whole, tmp_path, left):
+def test_a_training_that_was_killed_before_its_first_checkpoint_begins_again(whole, tmp_path, capsys, command, left):
     folder = tmp_path / "run"
     (folder / "metrics").mkdir(parents=True)
     if left != "no config":
         (folder / "config.json").write_bytes((whole[0] / "config.json").read_bytes())
-    if left == "its log":
         (folder / "metrics" / "seed-0.jsonl").write_text('{"step": 20, "kind": "update"}\n')
-    main([*LINE.split(), str(folder)])
+    if left == "a log and half a checkpoint":
+        (folder / "checkpoints" / ".000001-step-10.tmp").mkdir(parents=True)
+        (folder / "checkpoints" / "replay").mkdir()
+        (folder / "checkpoints" / "replay" / "000001.safetensors").write_bytes(b"half")
+    if command == "python":
+        resume(folder, report=lambda event: event.note and print(event.note))
+    else:
+        lines = {"resume": "resume", "train": LINE.replace("--resume ", ""), "train --resume": LINE}
+        main([*lines[command].split(), str(folder)])
     assert files(folder) == files(whole[0])
+    is_resumed = left != "no config" and command != "train"
+    assert ("no checkpoint was written: begins again from step 0" in capsys.readouterr().out) == is_resumed
+    assert len(Run(folder).config.get("resumed", ())) == is_resumed
 
 
 def test_what_is_no_unfinished_training_is_not_cleared(whole, tmp_path, capsys):
@@ -95,11 +110,11 @@ def test_what_is_no_unfinished_training_is_not_cleared(whole, tmp_path, capsys):
     shutil.copytree(whole[0], finished, ignore=shutil.ignore_patterns("checkpoints"))
     (other / "metrics").mkdir(parents=True)
     (other / "metrics" / "thesis.tex").touch()
-    for folder in (finished, other):
+    for folder, why in ((finished, "has no checkpoint to go on from any more"), (other, "exists already")):
         before = sorted(folder.rglob("*"))
         with pytest.raises(SystemExit):
             main([*LINE.split(), str(folder)])
-        assert "exists already, with nothing to go on from: choose another --out" in capsys.readouterr().err
+        assert why in capsys.readouterr().err
         assert sorted(folder.rglob("*")) == before
 
 
@@ -148,13 +163,26 @@ def test_the_log_has_no_gap_and_no_row_twice(whole):
     assert steps[-1] == 240
 
 
-def test_without_a_checkpoint_there_is_a_sentence(tmp_path):
-    with pytest.raises(Crash):
-        train(AGENT, "pendulum-v", tmp_path / "run", crash_at(1), **OPTIONS)
-    with pytest.raises(UserError, match="has no checkpoint to go on from"):
+def test_where_the_checkpoints_are_gone_there_is_a_sentence(whole, tmp_path):
+    (tmp_path / "run" / "checkpoints" / "damaged-000001-step-20").mkdir(parents=True)
+    (tmp_path / "run" / "config.json").write_bytes((whole[0] / "config.json").read_bytes())
+    with pytest.raises(UserError, match="has no checkpoint to go on from any more"):
         resume(tmp_path / "run")
     with pytest.raises(UserError, match="There is no run folder"):
         resume(tmp_path / "nowhere")
+
+
+def test_a_training_that_fails_before_it_saved_anything_blocks_nothing(tmp_path):
+    folder = tmp_path / "run"
+    for number in (1, 5, 9):  # an event of the making, the exploration and the pre-training
+        with pytest.raises(Crash):
+            train(AGENT, "pendulum-v", folder, crash_at(number), **OPTIONS | {"checkpoint_steps": 0})
+    with pytest.raises(UserError, match="step raised ValueError"):
+        train(AGENT, GymnasiumTask(Raising), folder, **OPTIONS)
+    run = train(AGENT, GymnasiumTask(Fine), folder, **OPTIONS | {"steps": 20})
+    assert run.config["task"] == "Fine"
+    with pytest.raises(UserError, match="exists already: choose another --out, or `beliefrl resume"):
+        train(AGENT, "pendulum-v", folder, **OPTIONS)
 
 
 def test_a_run_that_is_being_trained_is_not_touched(whole):
@@ -263,28 +291,6 @@ def test_trainings_in_other_threads_leave_signals_alone(tmp_path):
     assert not failed
 
 
-LIMITED = """
-import resource
-resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, 30_000))
-from beliefrl.cli import main
-main()
-"""
-
-
-@pytest.mark.slow
-def test_a_disk_that_is_full_is_one_sentence(tmp_path):
-    """No file may grow beyond 30 kB here, and a checkpoint is larger."""
-    words = "train sac-mlp pendulum-v --steps 60 --step-start-rl 20 --pretrain-updates 5 --batch-size 8"
-    words += " --policy-layers 8 --value-layers 256 256 --checkpoint-steps 20 --out run"
-    command = [sys.executable, "-c", LIMITED, *words.split()]
-    environment = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 2
-    assert done.stderr.startswith("beliefrl: ")
-    assert "cannot be written (File too large): mend that, then `beliefrl resume run` goes on" in done.stderr
-    assert done.stderr.count("\n") == 1
-
-
 def test_constants_that_are_tuples_are_the_same_when_a_run_goes_on(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     line = "train sac-mlp target-reaching --steps 4 --eval-episodes 1 --constants max_steps=2 --out run --resume"
@@ -306,7 +312,7 @@ def test_a_folder_that_cannot_be_locked_is_one_sentence(whole, tmp_path):
     ("line", "phrase"),
     [
         ("resume {whole} --steps 10", "may only grow"),
-        ("resume {whole} --steps ten", "--steps cannot be 'ten'"),
+        ("resume {whole} --steps ten", "--steps must be a whole number, not 'ten'"),
         ("train sac-mlp pendulum-v --out {whole}", "exists already: choose another --out, or `beliefrl resume"),
         ("train sac-mlp pendulum-v --out {whole} --resume", "was trained with"),
         ("train sac-mlp pendulum --out {whole} --resume", "was trained with task=pendulum-v, not pendulum"),

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from beliefrl import runs
+from beliefrl import folders, runs
 from beliefrl.provenance import provenance
 from beliefrl.runs import Recorder, Run
 from beliefrl.types import UserError
@@ -186,10 +186,10 @@ def test_finish_writes_the_results(recorder):
 
 def test_free_folder_takes_the_first_free_number(tmp_path):
     parent = str(tmp_path)
-    assert runs.free_folder("vrm-pendulum", parent) == tmp_path / "vrm-pendulum-1"
+    assert folders.free_folder("vrm-pendulum", parent) == tmp_path / "vrm-pendulum-1"
     (tmp_path / "vrm-pendulum-1").mkdir()
     (tmp_path / "vrm-pendulum-3").mkdir()
-    assert runs.free_folder("vrm-pendulum", parent) == tmp_path / "vrm-pendulum-2"
+    assert folders.free_folder("vrm-pendulum", parent) == tmp_path / "vrm-pendulum-2"
 
 
 def test_provenance_says_what_a_run_was_made_with():

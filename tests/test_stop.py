@@ -28,6 +28,25 @@ def test_a_second_signal_ends_the_program_at_once():
             process.kill()
 
 
+ANSWERING = """
+import hashlib, os, signal
+from beliefrl.stop import Requests
+with Requests(lambda: print("heard", flush=True)):
+    print("ready", flush=True)
+    os.kill(os.getpid(), signal.SIGTERM)
+    hashlib.pbkdf2_hmac('sha256', b'', b'', 10**9)
+"""
+
+
+def test_the_first_signal_is_answered_while_a_compiled_function_runs():
+    with subprocess.Popen([sys.executable, "-c", ANSWERING], stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert [process.stdout.readline(), process.stdout.readline()] == ["ready\n", "heard\n"]
+            assert process.poll() is None
+        finally:
+            process.kill()
+
+
 def test_signals_that_come_together_are_one_request():
     with subprocess.Popen([sys.executable, "-c", SLEEPER], stdout=subprocess.PIPE, text=True) as process:
         try:

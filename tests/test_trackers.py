@@ -95,6 +95,34 @@ def test_tensorboard_has_event_files(tmp_path):
     ]
 
 
+def test_all_are_closed_whatever_one_of_them_does(tmp_path, heard, monkeypatch):
+    def fail(self):
+        raise OSError("no room")
+
+    run = recorder(tmp_path / "run", ["tensorboard", "wandb"])
+    monkeypatch.setattr(heard["wandb", 1], "close", fail.__get__(heard["wandb", 1]))
+    with pytest.raises(KeyError, match="the first"), run:
+        raise KeyError("the first")
+    assert [heard[which].closed for which in heard] == [True, True, True, False]
+    again = Recorder(tmp_path / "run", None)
+    with pytest.raises(OSError, match="no room"), again:
+        again._trackers = {1: [heard["wandb", 1]]}
+    Recorder(tmp_path / "run", None).close()
+
+
+def test_a_tracker_that_cannot_be_opened_is_one_sentence_and_blocks_nothing(tmp_path, heard, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("\x1b[31mno key\x1b[0m\nlog in")
+
+    working = trackers.TRACKERS["wandb"]
+    monkeypatch.setitem(trackers.TRACKERS, "wandb", fail)
+    with pytest.raises(UserError, match=r"^track=wandb cannot be opened: RuntimeError: no key log in\.$"):
+        recorder(tmp_path / "run", ["tensorboard", "wandb"])
+    assert heard["tensorboard", 0].closed
+    monkeypatch.setitem(trackers.TRACKERS, "wandb", working)
+    recorder(tmp_path / "run", ["wandb"]).close()
+
+
 def went_on_elsewhere(folder):
     """A run with a checkpoint that was told to Weights & Biases on another machine."""
     run = a_run(folder / "run", [flat(1.0)])

@@ -11,6 +11,8 @@ from typing import Annotated, Any
 
 import tyro
 
+from beliefrl.values import VALUES
+
 
 class UsageError(Exception):
     """A mistake on the command line, as a sentence."""
@@ -41,11 +43,11 @@ def agent_name(argv: Sequence[str], command: str, more: str = "") -> tuple[str, 
 def parse(options: Any, argv: Sequence[str], prog: str) -> Any:
     """Options from the command line; a mistake becomes a sentence instead of tyro's box."""
     if any(arg in ("-h", "--help") for arg in argv):
-        return tyro.cli(options, prog=prog, args=argv)
+        return tyro.cli(options, prog=prog, args=argv, registry=VALUES)
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box), contextlib.redirect_stdout(box):
-            parsed, unknown = tyro.cli(options, prog=prog, args=argv, return_unknown_args=True)
+            parsed, unknown = tyro.cli(options, prog=prog, args=argv, return_unknown_args=True, registry=VALUES)
     except SystemExit:
         raise UsageError(f"{_sentence(box.getvalue())}; `{prog} --help` shows what can be given.") from None
     if unknown:
@@ -71,7 +73,7 @@ def named_values(given: Sequence[str], option: str) -> dict[str, Any]:
 
 WORDING = (  # tyro's, Python's, and ours
     (r"Missing from .*: (\w+) .*", r"\1 is missing"),
-    (r"Error parsing (\S+): invalid literal for int\(\) with base 10: (.*)", r"\1 must be a whole number, not \2"),
+    (r"Error parsing (\S+): (must be .*)", r"\1 \2"),
     (r"Error parsing (\S+): could not convert string to float: (.*)", r"\1 must be a number, not \2"),
     (r"Error parsing (\S+): .* \[(.*)\]", r"\1 cannot be \2"),
     (r"invalid choice (.*) for argument '(\S+)'. Expected one of \((.*)\)", r"\2 must be one of \3, not \1"),
@@ -83,7 +85,7 @@ def _sentence(box: str) -> str:
     """The first paragraph below the title of a box that tyro drew, on one line and in our words."""
     lines = [line.strip(" │|╭╮╰╯─-") for line in box.splitlines()[1:]]  # rules become empty
     paragraphs = " ".join(line or "\n" for line in lines).split("\n")
-    message = next(filter(str.strip, paragraphs), "That command line cannot be understood").strip().rstrip(".")
+    message = next(filter(str.strip, paragraphs), "That command line cannot be understood").strip().rstrip(". ")
     for theirs, ours in WORDING:
         message = re.sub(f"^{theirs}$", ours, message)
     return message

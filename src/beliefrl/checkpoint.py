@@ -97,13 +97,24 @@ class Checkpoints:
         except OSError as error:
             raise UserError(
                 f"The checkpoint in {self.folder} cannot be written ({error.strerror}): mend that, then "
-                f"`beliefrl resume {self.folder.parent}` goes on from the last one."
+                f"`beliefrl resume {self.folder.parent}` goes on."
             ) from None
 
     def close(self) -> None:
         """Wait, and take no more."""
-        self.wait()
-        self._thread.shutdown()
+        try:
+            self.wait()
+        finally:
+            self._thread.shutdown()
+
+    def __enter__(self) -> "Checkpoints":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self.abandon()
 
     def keep_for(self, name: str) -> pathlib.Path | None:
         """Keep the last checkpoint, whatever is written after it; returns where, or None where there is none."""
@@ -225,6 +236,12 @@ class Checkpoints:
 def listed(folder: pathlib.Path) -> list[pathlib.Path]:
     """The checkpoints in a run's folder, good or not."""
     return sorted((folder / "checkpoints").glob(f"{NUMBER}-step-*"))
+
+
+def was_ever_written(folder: pathlib.Path) -> bool:
+    """Whether a run's folder has or had a checkpoint, good or not; what a kill left of a first one does not count."""
+    inside = (path.name for path in (folder / "checkpoints").glob("*"))
+    return any(name != "replay" and not name.startswith(".") for name in inside)
 
 
 def _next_number(folder: pathlib.Path) -> int:

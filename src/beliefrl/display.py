@@ -40,7 +40,7 @@ class TrainingDisplay:
         self.progress = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
         self.bar = self.progress.add_task("starting", total=steps, told="")
         self.returns = ""
-        self.doing = ""
+        self.phase = ""
         self.began = self.phase_began = time.monotonic()
         self.phase_step = 0
 
@@ -57,7 +57,7 @@ class TrainingDisplay:
         if event.note is not None:
             self._line(now, event.note)
             return
-        if event.doing != self.doing and event.evaluation is None:
+        if event.doing not in ("evaluating", self.phase):
             self._begin_phase(event, now)
         if event.episodes is not None and np.any(event.episodes.done):
             ended = np.asarray(event.episodes.total)[np.asarray(event.episodes.done)]
@@ -75,12 +75,9 @@ class TrainingDisplay:
 
     def _begin_phase(self, event: Event, now: float) -> None:
         """Say what begins; time it from after its compilation."""
-        resumes = self.doing == "evaluating" and event.doing == "learning"
-        if not resumes and event.doing != "evaluating":
-            self.phase_began, self.phase_step = now, event.step
-            if not self.console.is_terminal:
-                self._line(now, event.doing)
-        self.doing = event.doing
+        self.phase, self.phase_began, self.phase_step = event.doing, now, event.step
+        if not self.console.is_terminal:
+            self._line(now, event.doing)
 
     def _speed(self, event: Event, now: float) -> str:
         steps = event.step - self.phase_step

@@ -9,7 +9,7 @@ from jaxtyping import Array, Key
 
 from beliefrl import agents, tasks
 from beliefrl.agents import Agent
-from beliefrl.host_loop import Evaluation
+from beliefrl.host_evaluation import Evaluation
 from beliefrl.phases import evaluate as evaluate_seed
 from beliefrl.rollout import Episode
 from beliefrl.runs import Run

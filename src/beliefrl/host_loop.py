@@ -12,31 +12,38 @@ A fault of an environment ends the training with what was learned and recorded u
 
 import ctypes
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Float, Int, Key
 
 from beliefrl import phases, rollout
 from beliefrl.agents import Agent
-from beliefrl.lockstep import Lockstep
+from beliefrl.host_evaluation import Evaluation
+from beliefrl.lockstep import Lockstep, environment_seeds
 from beliefrl.phases import ACT, REVIVE, Metrics, Program, Seed, Stretch, step_key
 from beliefrl.rollout import Episode
 from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
-from beliefrl.types import Spec, Step
+from beliefrl.types import Spec
 
 
 def program(
-    agent: Agent, task: GymnasiumTask, capacity: int, episodes: int, seeds: Sequence[int], processes: str
+    agent: Agent,
+    task: GymnasiumTask,
+    capacity: int,
+    episodes: int,
+    seeds: Sequence[int],
+    processes: str,
+    tell: Callable[[str], None] | None = None,
 ) -> Program:
-    """The phases of training with environments of their own for each of `seeds`."""
+    """The phases of training with environments of their own for each of `seeds`; `tell` is as in `Lockstep`."""
     _keep_memory()
-    loop = HostLoop(agent, task, capacity, seeds, processes)
-    evaluation = Evaluation(agent, task, seeds, processes)
+    loop = HostLoop(agent, task, capacity, Lockstep(task, [f"seed {seed}" for seed in seeds], processes, tell))
+    evaluation = Evaluation(agent, task, seeds, processes, tell)
 
     def close() -> None:
         loop.environments.close()
@@ -91,16 +98,15 @@ class Answer(NamedTuple):
 class HostLoop:
     """The environments of a training, and what is compiled around them."""
 
-    def __init__(self, agent: Agent, task: GymnasiumTask, capacity: int, seeds: Sequence[int], processes: str):
-        """An environment for each of `seeds`."""
-        self.agent, self.spec = agent, task.spec
-        self.environments = Lockstep(task, [f"seed {seed}" for seed in seeds], processes)
+    def __init__(self, agent: Agent, task: GymnasiumTask, capacity: int, environments: Lockstep):
+        """`environments` has one for each seed."""
+        self.agent, self.spec, self.environments = agent, task.spec, environments
         self._begin = jax.jit(jax.vmap(partial(_begin, agent, task.spec, capacity)))
         self._first = jax.jit(jax.vmap(lambda obs: rollout.first(agent, task.spec, (), obs)))
         self._act = jax.jit(jax.vmap(partial(_act, agent), in_axes=(0, None)))
         go_on, learn = partial(_go_on, agent, task.spec), partial(_learn, agent, task.spec)
-        self._go_on = jax.jit(jax.vmap(go_on, in_axes=(0, 0, 0, None)), donate_argnums=1)
-        self._learn = jax.jit(jax.vmap(learn, in_axes=(0, 0, None)), donate_argnums=0)
+        self._go_on: Any = jax.jit(jax.vmap(go_on, in_axes=(0, 0, 0, None)), donate_argnums=1)
+        self._learn: Any = jax.jit(jax.vmap(learn, in_axes=(0, 0, None)), donate_argnums=0)
 
     def begin(self, keys: Key[Array, " seed"]) -> Seed:
         """Seeds before their first steps."""
@@ -117,8 +123,10 @@ class HostLoop:
         return seeds._replace(actor=self._first(self.environments.reset(environment_seeds(keys))))
 
     def explore(self, seeds: Seed, first: int, steps: int) -> tuple[Seed, Stretch]:
-        """Environment steps without updates."""
+        """Environment steps without updates; none of them only compiles."""
         told, deed, networks = _Told(), self._act(seeds, first), _networks(seeds.state)
+        if steps == 0:
+            self._compile(seeds, deed, learns=False)
         for step in range(first, first + steps):
             answer = self._step(seeds, deed, step, told)
             rest, deed, episode = self._go_on(networks, seeds._replace(state=()), answer, step)
@@ -127,8 +135,10 @@ class HostLoop:
         return seeds, told.stretch()
 
     def learn(self, seeds: Seed, first: int, cycles: int) -> tuple[Seed, Stretch]:
-        """`cycles` cycles of steps and updates from environment step `first` on."""
+        """`cycles` cycles of steps and updates from environment step `first` on; none of them only compiles."""
         told, deed, cycle = _Told(), self._act(seeds, first), self.agent.cycle
+        if cycles == 0:
+            self._compile(seeds, deed, learns=True)
         for step in range(first, first + cycles * cycle):
             answer = self._step(seeds, deed, step, told)
             if (step + 1 - first) % cycle:
@@ -139,6 +149,21 @@ class HostLoop:
                 told.metrics.append(metrics)
             told.episodes.append(episode)
         return seeds, told.stretch()
+
+    def _compile(self, seeds: Seed, deed: "Deed", learns: bool) -> None:
+        """Compile what follows a step of the environments, so that no compilation is taken for a slow environment."""
+        lanes = len(deed.action)
+        obs, number, never = (
+            np.zeros((lanes, self.spec.obs_dim), np.float32),
+            np.zeros(lanes, np.float32),
+            np.zeros(lanes, bool),
+        )
+        answer = Answer(deed, obs, number, never, never, never, obs)
+        if isinstance(self._go_on, jax.stages.Wrapped) and (self.agent.cycle > 1 or not learns):
+            rest = seeds._replace(state=())
+            self._go_on = self._go_on.lower(_networks(seeds.state), rest, answer, 0).compile()
+        if learns:
+            self._learn = self._learn.lower(seeds, answer, 0).compile()
 
     def _step(self, seeds: Seed, deed: "Deed", step: int, told: "_Told") -> "Answer":
         """One step of every environment."""
@@ -164,13 +189,6 @@ class _Told:
         metrics, episodes = jax.device_get((self.metrics, self.episodes))
         means = jax.tree.map(lambda *each: np.mean(each, axis=0), *metrics) if metrics else {}
         return Stretch(means, jax.tree.map(lambda *each: np.stack(each, axis=1), *episodes) if episodes else None)
-
-
-def environment_seeds(keys: Key[Array, "*lane"]) -> Int[np.ndarray, "*lane"]:
-    """A seed for the environment of each key."""
-    return np.asarray(jax.vmap(lambda key: jax.random.randint(key, (), 0, 2**31 - 1))(keys.reshape(-1))).reshape(
-        keys.shape
-    )
 
 
 def _begin(agent: Agent, spec: Spec, capacity: int, key: Key[Array, ""], obs: Float[Array, " obs"]) -> Seed:
@@ -216,84 +234,3 @@ def _learn(
     state, metrics = phases.learn_cycle(agent, seed, step + 1 - agent.cycle)
     seed = seed._replace(state=state)
     return seed, _act(agent, seed, step + 1), episode, metrics
-
-
-class Evaluation:
-    """Environments for evaluation: two for each seed, one played with sampled and one with mode actions."""
-
-    def __init__(self, agent: Agent, task: GymnasiumTask, seeds: Sequence[int], processes: str):
-        """They are made at the first evaluation."""
-        self.agent, self.task, self.seeds, self.processes = agent, task, seeds, processes
-        self.environments: Lockstep | None = None
-        lanes = jax.vmap(partial(_perceive, agent, task.spec), in_axes=(None, 0, 0, 0, 0, None))
-        self._perceive = jax.jit(jax.vmap(lanes, in_axes=(0, 0, 0, 0, None, None)))
-
-    def play(self, states: Any, keys: Key[Array, " seed"], episodes: int) -> Episode:
-        """`episodes` episodes, one after the other; leaves (seed, 2, episodes)."""
-        if self.environments is None:
-            lanes = [f"evaluation of seed {seed}" for seed in self.seeds for _ in range(2)]
-            self.environments = Lockstep(self.task, lanes, self.processes)
-        keys = jax.vmap(lambda key: jax.random.split(key, 2))(keys)
-        obs = self.environments.reset(environment_seeds(keys).reshape(-1))
-        lanes = len(obs)
-        action: Any = np.zeros((lanes, self.task.spec.action_dim), np.float32)
-        never: Any = np.zeros(lanes, bool)
-        step = Step(obs, never.astype(np.float32), action, ~never, never)
-        empty = self.agent.reset(self.task.spec)
-        memory = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*keys.shape, *leaf.shape)), empty)
-        record, total, length = _Record(lanes, episodes), np.zeros(lanes), np.zeros(lanes, int)
-        explore, time = np.array([True, False]), 0
-        while not record.full:
-            perceived = jax.tree.map(lambda leaf: leaf.reshape(*keys.shape, *leaf.shape[1:]), step)
-            action, memory = self._perceive(states, memory, perceived, keys, explore, time)
-            action = np.asarray(action).reshape(lanes, -1)
-            obs, reward, terminated, truncated, success = self.environments.step(action)
-            total, length, done, time = total + reward, length + 1, terminated | truncated, time + 1
-            record.add(done, total, length, success)
-            if done.any():
-                obs = self.environments.restart(done)
-                total, length = np.where(done, 0.0, total), np.where(done, 0, length)
-            step = Step(obs, reward * ~done, action * ~done[:, None], done, never)
-        return jax.tree.map(lambda leaf: leaf.reshape(*keys.shape, episodes), record.episodes)
-
-    def close(self) -> None:
-        """Close the environments, if there are any."""
-        if self.environments is not None:
-            self.environments.close()
-
-
-def _perceive(
-    agent: Agent,
-    spec: Spec,
-    state: Any,
-    memory: Any,
-    step: Step,
-    key: Key[Array, ""],
-    explore: Bool[Array, ""],
-    time: Int[Array, ""],
-) -> tuple[Float[Array, " action"], Any]:
-    empty = agent.reset(spec)
-    memory = jax.tree.map(lambda new, old: jnp.where(step.is_first, new, old), empty, memory)
-    return agent.act(state, memory, step, jax.random.fold_in(key, time), explore)
-
-
-class _Record:
-    """The first episodes of every lane."""
-
-    def __init__(self, lanes: int, episodes: int):
-        shape = (lanes, episodes)
-        columns: Any = [np.zeros(shape, kind) for kind in (bool, np.float32, np.int32, bool)]
-        self.episodes = Episode(*columns)
-        self.count = np.zeros(lanes, int)
-
-    @property
-    def full(self) -> bool:
-        """Whether every lane has all its episodes."""
-        return bool(self.episodes.done.all())
-
-    def add(self, done: Any, *values: Any) -> None:
-        """What ended, where `done` and still wanted; values are Episode's other fields, leaves (lane,)."""
-        lanes = np.flatnonzero(done & (self.count < self.episodes.done.shape[1]))
-        for column, value in zip(self.episodes, (done, *values), strict=True):
-            column[lanes, self.count[lanes]] = value[lanes]
-        self.count[lanes] += 1

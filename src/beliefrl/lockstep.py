@@ -8,20 +8,23 @@ import multiprocessing
 import os
 import signal
 import sys
+import threading
 import time
-from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Literal, NamedTuple
 
+import jax
 import numpy as np
 from gymnasium import logger
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from beliefrl.tasks.gymnasium import Environment, Fault, GymnasiumTask
 from beliefrl.types import UserError
 
 HANDOVER = 5e-4  # seconds that giving a step to other processes costs, about
-PROCESSES = ("auto", "always", "never")
+SLOW = 60.0  # seconds after which a call that has not returned is reported
+Processes = Literal["auto", "always", "never"]
 
 
 class Answers(NamedTuple):
@@ -34,16 +37,30 @@ class Answers(NamedTuple):
     success: Any  # (lane,) bool
 
 
+class _Call(NamedTuple):
+    """Of the environments: what was called, and when."""
+
+    name: str
+    began: float
+
+
 class Lockstep:
     """Environments of a task, all stepped together."""
 
-    def __init__(self, task: GymnasiumTask, lanes: Sequence[str], processes: str = "auto"):
+    def __init__(
+        self,
+        task: GymnasiumTask,
+        lanes: Sequence[str],
+        processes: str = "auto",
+        tell: Callable[[str], None] | None = None,
+    ):
         """Make an environment for each of `lanes`, the names under which their faults are told.
 
         Args:
             task: what they are of.
             lanes: for example "seed 0".
             processes: "always" gives each a process of its own, "never" none, "auto" where that pays.
+            tell: is called by another thread with a sentence when a step, a reset or the making takes longer than SLOW.
 
         Raises:
             UserError: the environment cannot be made, or is not supported.
@@ -51,9 +68,13 @@ class Lockstep:
         self.task, self.lanes = task, lanes
         self.steps = 0
         self._envs: Any = None
+        self._call: _Call | None = None  # the call of the environments that has not returned
+        self._closed = threading.Event()
+        if tell is not None:
+            threading.Thread(target=self._watch, args=(tell,), daemon=True).start()
         factories = [_Factory(task, lane) for lane in lanes]
-        self.apart = processes == "always" or (processes == "auto" and _pays(task, len(lanes)))
-        with self._faults():
+        with self._calling("gymnasium.make"):
+            self.apart = processes == "always" or (processes == "auto" and _pays(task, len(lanes)))
             if self.apart:
                 # Forking a process in which JAX runs threads may never return.
                 self._envs = AsyncVectorEnv(factories, context="spawn", autoreset_mode=AutoresetMode.DISABLED)
@@ -62,24 +83,25 @@ class Lockstep:
 
     def reset(self, seeds: Int[np.ndarray, " lane"]) -> Any:
         """Begin an episode everywhere; returns what is observed, (lane, obs)."""
-        with self._faults():
+        with self._calling("reset"):
             return self._envs.reset(seed=[int(seed) for seed in seeds])[0]
 
     def step(self, actions: Float[np.ndarray, "lane action"]) -> "Answers":
         """Act everywhere."""
         self.steps += 1
-        with self._faults():
+        with self._calling("step"):
             obs, reward, terminated, truncated, info = self._envs.step(actions)
         return Answers(obs, reward.astype(np.float32), terminated, truncated, np.asarray(info["success"], bool))
 
     def restart(self, done: Bool[np.ndarray, " lane"]) -> Any:
         """Begin an episode where one is done; returns what is observed everywhere, (lane, obs)."""
-        with self._faults():
+        with self._calling("reset"):
             return self._envs.reset(options={"reset_mask": done})[0]
 
     def close(self) -> None:
         """Close them all; what goes wrong in that concerns nobody any more."""
-        if self.apart and not self._idle:  # they would be asked to finish their step first
+        self._closed.set()
+        if self.apart and self._call is not None:  # they would be asked to finish their step first
             for process in self._envs.processes:
                 process.terminate()
                 process.join()
@@ -88,15 +110,27 @@ class Lockstep:
             self._envs.close()
 
     @contextlib.contextmanager
-    def _faults(self) -> Iterator[None]:
-        """A lane's process that has died is a Fault."""
-        self._idle = False
+    def _calling(self, name: str) -> Iterator[None]:
+        """What is called in the environments; a lane's process that has died meanwhile is a Fault."""
+        self._call = _Call(name, time.monotonic())
         try:
             with _silence():
                 yield
-            self._idle = True
+            self._call = None
         except (EOFError, ConnectionError, BrokenPipeError):
             raise Fault(self._death()) from None
+
+    def _watch(self, tell: Callable[[str], None]) -> None:
+        """Report every call that takes longer than SLOW, once."""
+        reported = None
+        while not self._closed.wait(SLOW / 60):
+            call = self._call
+            if call is None or call is reported or time.monotonic() - call.began < SLOW:
+                continue
+            reported = call
+            at = f" (step {self.steps})" if self.steps else ""
+            with contextlib.suppress(Exception):  # whoever listens must not end the watch
+                tell(f"{self.task.name}{at}: {call.name} has not returned for {SLOW:.0f} s: it is slow, or it hangs.")
 
     def _death(self) -> str:
         dead = []
@@ -159,3 +193,10 @@ def step_seconds(task: GymnasiumTask, steps: int = 20) -> float:
     except UserError:
         return 0.0
     return float(np.median(times))
+
+
+def environment_seeds(keys: Key[Array, "*lane"]) -> Int[np.ndarray, "*lane"]:
+    """A seed for the environment of each key."""
+    return np.asarray(jax.vmap(lambda key: jax.random.randint(key, (), 0, 2**31 - 1))(keys.reshape(-1))).reshape(
+        keys.shape
+    )

@@ -24,7 +24,7 @@ from beliefrl.evaluation import restore_seed
 from beliefrl.runs import Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import GymnasiumTask
-from beliefrl.types import LARGEST, Spec, Step, UserError
+from beliefrl.types import LARGEST, Spec, Step, UserError, short
 
 State = tuple[np.ndarray, ...]
 
@@ -187,7 +187,7 @@ def _numbers(value: Any, name: str) -> np.ndarray:
     except ValueError:  # rows of different lengths
         array = np.empty(0, object)
     if array.dtype.kind not in "biuf":
-        raise UserError(f"{name} must be real numbers, not {_short(value)}.")
+        raise UserError(f"{name} must be real numbers, not {short(value)}.")
     with np.errstate(over="ignore"):
         return array.astype(np.float32)
 
@@ -196,7 +196,7 @@ def _flags(value: Any, batch: int, name: str) -> np.ndarray:
     """True or False for each episode of a batch."""
     array = np.asarray(value)
     if array.dtype.kind not in "biu" or not np.isin(array, (0, 1)).all():
-        raise UserError(f"{name} must be True or False, not {_short(value)}.")
+        raise UserError(f"{name} must be True or False, not {short(value)}.")
     return _each(array.astype(bool), batch, name)
 
 
@@ -224,8 +224,3 @@ def _where_first(is_first: Any, empty: Any, leaf: Any) -> Any:
 
 def _count(number: int, what: str) -> str:
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
-
-
-def _short(value: Any) -> str:
-    text = " ".join(repr(value).split())
-    return text if len(text) <= 80 else f"{text[:77]}..."

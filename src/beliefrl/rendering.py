@@ -15,8 +15,8 @@ from jaxtyping import UInt8
 
 from beliefrl.environment import TaskEnvironment
 from beliefrl.tasks import Task
-from beliefrl.tasks.gymnasium import Environment, GymnasiumTask, said
-from beliefrl.types import UserError
+from beliefrl.tasks.gymnasium import Environment, GymnasiumTask
+from beliefrl.types import UserError, said
 
 Pixels = UInt8[np.ndarray, "height width 3"]
 PACE = 10  # steps a second where a task does not tell how long a step is

@@ -10,11 +10,10 @@
 Lines are written out one by one, so a killed training loses at most the line it was writing, which `rows` skips.
 """
 
+import contextlib
 import json
 import os
 import pathlib
-import re
-import shutil
 from collections.abc import Collection, Iterator
 from typing import Any
 
@@ -22,6 +21,7 @@ import numpy as np
 
 from beliefrl import arrays, trackers
 from beliefrl.arrays import write_whole
+from beliefrl.folders import is_complete, locked, make, write_config
 from beliefrl.provenance import now
 from beliefrl.trackers import Tracker
 from beliefrl.types import UserError
@@ -52,7 +52,7 @@ class Run:
             ) from None
         except (OSError, ValueError):
             raise UserError(f"{path} cannot be read as JSON: restore it, or train again.") from None
-        if not _is_complete(self.config):
+        if not is_complete(self.config):
             raise UserError(f"{path} lacks what a training writes there: restore it, or train again.")
 
     @property
@@ -119,34 +119,54 @@ class Recorder(Run):
         """Make the folder; without a config, go on with one that exists.
 
         Raises:
-            UserError: it exists already, or cannot be made; or does not exist, or another process writes it.
+            UserError: it exists already, or cannot be made; or does not exist, or another process writes it; or a
+                tracker cannot be opened.
         """
         folder = pathlib.Path(folder)
         if config is not None:
-            _make(folder, config)
+            make(folder, config)
         super().__init__(folder)
         self._lock = locked(folder, "is being trained")
         self._lines: dict[int, Any] = {}
         self._trackers: dict[int, list[Tracker]] = {}
         if config is not None:
-            self._open()
+            with contextlib.ExitStack() as stack:
+                stack.push(self)
+                self._open()
+                stack.pop_all()
+
+    def __enter__(self) -> "Recorder":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        try:
+            self.close()
+        except Exception:
+            if kind is None:  # else the first error is the one to tell
+                raise
 
     def _open(self) -> None:
-        self._lines = {seed: self._metrics(seed).open("a", buffering=1) for seed in self.seeds}
         track = self.config["options"].get("track", ("tensorboard",))
-        self._trackers = {seed: trackers.open_all(track, self.folder, seed, self.config) for seed in self.seeds}
+        for seed in self.seeds:
+            path = self._metrics(seed)
+            try:
+                self._lines[seed] = path.open("a", buffering=1)
+            except OSError as error:
+                raise UserError(f"{path} cannot be written ({error.strerror}): mend that, then try again.") from None
+            self._trackers[seed] = trackers.open_all(track, self.folder, seed, self.config)
 
     def note_end(self) -> None:
-        """Write down when this process has ended with the run."""
+        """Write down when this process has ended with the run, if the disk has room for it."""
         session = self.config["resumed"][-1] if self.config.get("resumed") else self.config
         session["ended"] = now()
-        _write_config(self.folder, self.config)
+        with contextlib.suppress(OSError):
+            write_config(self.folder, self.config)
 
     def amend(self, changes: dict[str, Any], session: dict[str, Any]) -> None:
         """Change the config, and add what goes on with the run to its `resumed`."""
         self.config |= changes
         self.config["resumed"] = [*self.config.get("resumed", ()), session]
-        _write_config(self.folder, self.config)
+        write_config(self.folder, self.config)
 
     def lengths(self) -> dict[int, int]:
         """Bytes in the log of each seed, which are on the disk then."""
@@ -156,16 +176,18 @@ class Recorder(Run):
         return {seed: self._metrics(seed).stat().st_size for seed in self.seeds}
 
     def rewind(self, lengths: dict[int, int]) -> None:
-        """Cut the log of each seed back to so many bytes, and go on from there.
+        """Cut the log of each seed back to so many bytes, and go on from there; 0 begins it again.
 
         Raises:
             UserError: a log is shorter.
         """
         for seed, length in lengths.items():
             path = self._metrics(seed)
-            if not path.exists() or path.stat().st_size < length:
+            size = path.stat().st_size if path.exists() else 0
+            if size < length:
                 raise UserError(f"{path} is shorter than when the checkpoint was written: restore it from a copy.")
-            os.truncate(path, length)
+            if size > length:
+                os.truncate(path, length)
         self._open()
         for seed in self.seeds:
             whole = [tracker for tracker in self._trackers[seed] if tracker.is_whole]
@@ -196,10 +218,11 @@ class Recorder(Run):
         write_whole(self.folder / "results.json", (json.dumps(results, indent=2) + "\n").encode())
 
     def close(self) -> None:
-        """Close the logs, and let others write the folder."""
-        for writer in (*self._lines.values(), *(each for of_seed in self._trackers.values() for each in of_seed)):
-            writer.close()
-        self._lock.close()
+        """Close the logs, and let others write the folder. All are closed, even if closing one of them fails."""
+        with contextlib.ExitStack() as stack:
+            stack.callback(self._lock.close)
+            for writer in (*self._lines.values(), *(each for of_seed in self._trackers.values() for each in of_seed)):
+                stack.callback(writer.close)
 
 
 def _tell(told: list[Tracker], kind: str, step: int, values: Row) -> None:
@@ -221,75 +244,3 @@ def _parsed(text: str, what: str, keys: tuple[str, ...]) -> Row:
     if not isinstance(row, dict) or (row and not all(key in row for key in keys)):
         raise UserError(f"{what} is damaged: restore it from a copy, or remove it.")
     return row
-
-
-def _make(folder: pathlib.Path, config: dict[str, Any]) -> None:
-    try:
-        folder.mkdir(parents=True)
-        (folder / "metrics").mkdir()
-        _write_config(folder, config)
-    except FileExistsError:
-        raise UserError(f"{folder} exists already: choose another --out, or `beliefrl resume {folder}`.") from None
-    except OSError as error:
-        raise UserError(f"The run folder {folder} cannot be made ({error.strerror}): choose another --out.") from None
-
-
-def _write_config(folder: pathlib.Path, config: dict[str, Any]) -> None:
-    write_whole(folder / "config.json", (json.dumps(config, indent=2, default=str) + "\n").encode())
-
-
-def clear(folder: pathlib.Path) -> None:
-    """Remove what a training left that was killed before its first checkpoint, so that it can begin anew.
-
-    Raises:
-        UserError: another process writes it, it holds results, or no training made it.
-    """
-    begun = (folder / "config.json").exists() and not (folder / "results.json").exists()
-    bare = all(path.name in ("metrics", ".config.json.tmp") for path in folder.rglob("*"))
-    if not (begun or bare):
-        raise UserError(f"{folder} exists already, with nothing to go on from: choose another --out.")
-    with locked(folder, "is being trained"):
-        shutil.rmtree(folder)
-
-
-def locked(folder: pathlib.Path, doing: str) -> Any:
-    """An open file that no other process can lock; the system lets go of it when this one ends, however it ends.
-
-    Raises:
-        UserError: the folder cannot be written, or another process is doing something with it.
-    """
-    try:
-        file = (folder / "lock").open("a+")
-    except OSError as error:
-        raise UserError(f"{folder} cannot be written ({error.strerror}): make it writable, or copy it.") from None
-    try:
-        import fcntl
-
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except ImportError:  # not on this system
-        return file
-    except OSError:
-        file.seek(0)
-        who = file.read().strip() or "another"
-        file.close()
-        raise UserError(f"{folder} {doing} by process {who}: stop it, or wait until it has ended.") from None
-    file.truncate(0)
-    file.write(str(os.getpid()))
-    file.flush()
-    return file
-
-
-def _is_complete(config: Any) -> bool:
-    """Whether a config.json holds what is read from it."""
-    kinds = {"agent": str, "hyperparameters": dict, "task": str, "constants": dict, "options": dict}
-    if not isinstance(config, dict) or not all(isinstance(config.get(key), kind) for key, kind in kinds.items()):
-        return False
-    return all(isinstance(config["options"].get(key), int) for key in ("seed", "seeds"))
-
-
-def free_folder(name: str, parent: str = "runs") -> pathlib.Path:
-    """The first of runs/NAME-1, runs/NAME-2, ... that does not exist; what no file is called becomes a dash."""
-    number, name = 1, re.sub(r"[^\w.-]+", "-", name)
-    while (folder := pathlib.Path(parent) / f"{name}-{number}").exists():
-        number += 1
-    return folder

@@ -6,7 +6,7 @@ yields what happens, `train` records it in a run's folder.
 
 import dataclasses
 from collections.abc import Callable, Iterator
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import numpy as np
@@ -14,7 +14,7 @@ import numpy as np
 from beliefrl import host_loop, phases, trackers
 from beliefrl.agents import Agent
 from beliefrl.evaluation import MOST_EPISODES
-from beliefrl.lockstep import PROCESSES
+from beliefrl.lockstep import Processes
 from beliefrl.phases import Metrics, Program, Seed
 from beliefrl.rollout import Episode
 from beliefrl.tasks import Task
@@ -38,7 +38,7 @@ class Options:
     """Episodes of each evaluation, with sampled actions and again with mode actions."""
     replay_capacity: int = 1_000_000
     """Most moments that a seed's replay keeps; the oldest make room."""
-    processes: str = "auto"
+    processes: Processes = "auto"
     """Gymnasium environments: a process for each (always), for none (never), or where that pays (auto, from the command
     line). A Python script that says always must begin under `if __name__ == "__main__":`."""
     checkpoint_steps: int = 2_000
@@ -59,7 +59,7 @@ class Options:
         check_range(self, ("keep_checkpoints",), 1, 1_000_000)
         check_range(self, ("seeds",), 1, 10_000)
         check_range(self, ("seed",), 0, 2_000_000_000)
-        check_choice(self, "processes", PROCESSES)
+        check_choice(self, "processes", get_args(Processes))
         for name in self.track:
             if name not in trackers.TRACKERS:
                 raise UserError(f"track={name} is impossible: it must be {' or '.join(trackers.TRACKERS)}.")
@@ -96,11 +96,20 @@ class Event(NamedTuple):
 
 
 def stages(
-    agent: Agent, task: Task | GymnasiumTask, options: Options, restore: Callable[[Seed], Snapshot] | None = None
+    agent: Agent,
+    task: Task | GymnasiumTask,
+    options: Options,
+    restore: Callable[[Seed], Snapshot] | None = None,
+    tell: Callable[[str], None] | None = None,
 ) -> Iterator[Event]:
     """Train; yields an Event before whatever takes long and after whatever gave something to tell.
 
-    `restore` is given the shapes of a training's arrays, and returns those to go on from.
+    Args:
+        agent: what learns.
+        task: on what.
+        options: how long.
+        restore: is given the shapes of a training's arrays, and returns those to go on from.
+        tell: is called by another thread with what cannot wait for the next Event, a sentence.
 
     Raises:
         Fault: of a Gymnasium environment, after an Event with what was learned until then.
@@ -108,12 +117,14 @@ def stages(
     numbers = range(options.seed, options.seed + options.seeds)
     sizes = capacity(agent, options), options.eval_episodes
     if isinstance(task, GymnasiumTask):
-        program = host_loop.program(agent, task, *sizes, numbers, options.processes)
+        yield Event("making the environments", 0)
+        program = host_loop.program(agent, task, *sizes, numbers, options.processes, tell)
     else:
         program = phases.compile_program(agent, task, *sizes)
     keys = jax.vmap(jax.random.key)(np.array(numbers))
     try:
         if restore is None:
+            yield Event("compiling the agent", 0)
             start = Snapshot(Progress(), program.begin(keys))
         else:
             at, seeds = restore(program.shapes(keys))
@@ -122,7 +133,8 @@ def stages(
     except Fault as fault:
         if fault.seeds is not None:
             metrics, episodes = fault.told or ({}, None)
-            yield Event("stopped by a fault", fault.step, metrics, episodes, states=fault.seeds.state)
+            learned = fault.seeds.state if fault.step >= agent.step_start_rl else None
+            yield Event("stopped by a fault", fault.step, metrics, episodes, states=learned)
         raise
     finally:
         program.close()
@@ -134,18 +146,23 @@ def _stages(agent: Agent, program: Program, options: Options, at: Progress, seed
 
     if at.step < explored:
         yield Event("compiling the exploration", at.step)
+        seeds, _ = program.explore(seeds, at.step, 0)
+        yield Event("exploring", at.step)
     while at.step < explored:
         steps = min(stretch, explored - at.step, _until(at.step, options.eval_every))
         seeds, told = program.explore(seeds, at.step, steps)
         at = at._replace(step=at.step + steps)
         yield Event("exploring", at.step, episodes=told.episodes)
         if at.step % options.eval_every == 0:
-            yield from _evaluation(program, seeds, at.step)
+            yield from _evaluation(program, seeds, at.step, "exploring")
             at = at._replace(evaluated=at.step)
         yield Event("exploring", at.step, snapshot=Snapshot(at, seeds))
 
     if at.step < options.steps and agent.pretrain_updates and not at.relived:
-        yield Event("compiling the pre-training", at.step)
+        if at.pretrained < agent.pretrain_updates:
+            yield Event("compiling the pre-training", at.step)
+            seeds, _ = program.pretrain(seeds, at.pretrained, 0)
+            yield Event("pre-training", at.step)
         while at.pretrained < agent.pretrain_updates:
             updates = min(stretch, agent.pretrain_updates - at.pretrained)
             seeds, metrics = program.pretrain(seeds, at.pretrained, updates)
@@ -157,6 +174,8 @@ def _stages(agent: Agent, program: Program, options: Options, at: Progress, seed
 
     if at.step < options.steps:
         yield Event("compiling the learning", at.step)
+        seeds, _ = program.learn(seeds, at.step, 0)
+        yield Event("learning", at.step)
     while at.step < options.steps:
         until = min(options.steps - at.step, _until(at.step, options.eval_every))
         cycles = min(-(-until // agent.cycle), stretch // agent.cycle)
@@ -164,11 +183,11 @@ def _stages(agent: Agent, program: Program, options: Options, at: Progress, seed
         before, at = at.step, at._replace(step=at.step + cycles * agent.cycle)
         yield Event("learning", at.step, told.metrics, told.episodes)
         if at.step // options.eval_every > before // options.eval_every:
-            yield from _evaluation(program, seeds, at.step)
+            yield from _evaluation(program, seeds, at.step, "learning")
             at = at._replace(evaluated=at.step)
         yield Event("learning", at.step, snapshot=Snapshot(at, seeds))
     if at.evaluated < at.step:
-        yield from _evaluation(program, seeds, at.step)
+        yield from _evaluation(program, seeds, at.step, "learning")
         yield Event("finished", at.step, snapshot=Snapshot(at._replace(evaluated=at.step), seeds))
 
 
@@ -188,7 +207,7 @@ def _until(step: int, every: int) -> int:
     return every - step % every
 
 
-def _evaluation(program: Program, seeds: Seed, step: int) -> Iterator[Event]:
+def _evaluation(program: Program, seeds: Seed, step: int, doing: str) -> Iterator[Event]:
     yield Event("evaluating", step)
     keys = jax.vmap(lambda key: jax.random.fold_in(jax.random.fold_in(key, phases.EVALUATE), step))(seeds.key)
     try:
@@ -196,4 +215,4 @@ def _evaluation(program: Program, seeds: Seed, step: int) -> Iterator[Event]:
     except Fault as fault:
         fault.seeds, fault.step = seeds, step
         raise
-    yield Event("learning", step, evaluation=result, states=seeds.state)
+    yield Event(doing, step, evaluation=result, states=seeds.state)

@@ -8,10 +8,11 @@ import importlib.util
 import os
 import pathlib
 import shutil
+import time
 from collections.abc import Sequence
 from typing import Any, Protocol, runtime_checkable
 
-from beliefrl.types import UserError
+from beliefrl.types import UserError, said
 
 
 @runtime_checkable
@@ -26,20 +27,28 @@ class Tracker(Protocol):
 
 
 class TensorBoard:
-    """Event files in tensorboard/seed-N."""
+    """Event files in tensorboard/seed-N.
+
+    tensorboardX's SummaryWriter writes in a thread of its own. On a full disk that thread ends, and whoever logs waits
+    for it for ever. So the events are written here, and an error is raised where it happens.
+    """
 
     is_whole = True
 
     def __init__(self, folder: pathlib.Path, seed: int, config: dict[str, Any]):
-        from tensorboardX import SummaryWriter  # 0.5 s to import
+        from tensorboardX.event_file_writer import EventsWriter  # 0.5 s to import
+        from tensorboardX.proto.event_pb2 import Event
+        from tensorboardX.summary import scalar
 
         path = folder / "tensorboard" / f"seed-{seed}"
         shutil.rmtree(path, ignore_errors=True)
-        self._writer = SummaryWriter(str(path))
+        path.mkdir(parents=True)
+        self._writer, self._event, self._scalar = EventsWriter(str(path / "events")), Event, scalar
 
     def log(self, step: int, values: dict[str, float]) -> None:
         for name, value in values.items():
-            self._writer.add_scalar(name, value, step)
+            event = self._event(wall_time=time.time(), step=step, summary=self._scalar(name, value))
+            self._writer.write_event(event)
 
     def flush(self) -> None:
         self._writer.flush()
@@ -96,5 +105,17 @@ def check(names: Sequence[str]) -> None:
 
 
 def open_all(names: Sequence[str], folder: pathlib.Path, seed: int, config: dict[str, Any]) -> list[Tracker]:
-    """The trackers of a seed."""
-    return [TRACKERS[name](folder, seed, config) for name in names]
+    """The trackers of a seed.
+
+    Raises:
+        UserError: one of them cannot be opened.
+    """
+    opened: list[Tracker] = []
+    for name in names:
+        try:
+            opened.append(TRACKERS[name](folder, seed, config))
+        except Exception as error:  # whatever a stranger's library may raise
+            for tracker in opened:
+                tracker.close()
+            raise UserError(f"track={name} cannot be opened: {said(error)}.") from None
+    return opened

@@ -7,22 +7,21 @@ import contextlib
 import dataclasses
 import os
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
 
-from beliefrl import agents, runs, tasks, trackers
+from beliefrl import agents, folders, log, tasks, trackers
 from beliefrl.agents import Agent
 from beliefrl.analysis.curves import draw_curve
-from beliefrl.checkpoint import Checkpoints, listed
-from beliefrl.evaluation import MODES, agent_of, summary, task_of, tuples
+from beliefrl.checkpoint import Checkpoints, listed, was_ever_written
+from beliefrl.evaluation import agent_of, task_of, tuples
 from beliefrl.phases import Seed
 from beliefrl.provenance import provenance
-from beliefrl.rollout import Episode
 from beliefrl.runs import Recorder, Run
 from beliefrl.schedule import Event, Options, Progress, Snapshot, capacity, stages
 from beliefrl.stop import Requests, Stopped
@@ -45,8 +44,9 @@ def train(
     Args:
         agent: an agent, or the name of one with its default hyperparameters.
         task: a task, or the name of one.
-        out: the run's folder, which must not exist; None is runs/AGENT-TASK-1, or the next free number.
-        report: called with every Event as it happens, for progress.
+        out: the run's folder; None is runs/AGENT-TASK-1, or the next free number. It must not exist, unless it is empty
+            or a training left it that ended before it saved an agent or a checkpoint; then it is used again.
+        report: called with every Event as it happens, for progress. Notes that cannot wait come from another thread.
         options: the fields of `Options`: steps, seeds, seed, eval_every, eval_episodes, replay_capacity, processes,
             checkpoint_steps, checkpoint_minutes, keep_checkpoints, track.
 
@@ -54,8 +54,9 @@ def train(
         The finished run: its results, its log, its files (`runs`).
 
     Raises:
-        UserError: an unknown name or option, an impossible value, `out` exists, or a Gymnasium environment did what
-            none may do; then what was learned and logged until that step is saved.
+        UserError: an unknown name or option, an impossible value, `out` exists, a tracker cannot be opened, the disk is
+            full, or a Gymnasium environment did what none may do; then what was learned and logged until that step is
+            saved.
         Stopped: Ctrl-C or SIGTERM, once a checkpoint is written; `resume` goes on. It is a KeyboardInterrupt.
     """
     agent = agents.make(agent) if isinstance(agent, str) else agent
@@ -73,7 +74,7 @@ def train(
         "options": dataclasses.asdict(chosen),
         **provenance(),
     }
-    recorder = Recorder(out or runs.free_folder(f"{config['agent']}-{config['task']}"), config)
+    recorder = Recorder(out or folders.free_folder(f"{config['agent']}-{config['task']}"), config)
     return _Training(recorder, agent, made, chosen, report).run()
 
 
@@ -87,34 +88,38 @@ def resume(
 
     On the same machine the metrics and the networks are those of a training that was not interrupted, to the last bit;
     on a Gymnasium environment the episode that was going on is not, since its state cannot be saved: a new one begins.
+    A training that was stopped before its first checkpoint begins again from step 0.
 
     Args:
         run: a run, or its folder.
         steps: train for so many environment steps in all; None: as many as before. They may only grow.
         task: needed only where the run was trained on a task of your own.
-        report: called with every Event as it happens, for progress.
+        report: as in `train`.
 
     Raises:
-        UserError: there is no such run, it has no good checkpoint, another process trains it, or `steps` are too few.
+        UserError: there is no such run, none of its checkpoints is good or left, another process trains it, or `steps`
+            are too few.
         Stopped: Ctrl-C or SIGTERM, once a checkpoint is written.
     """
-    folder = (run if isinstance(run, Run) else Run(run)).folder
-    if not listed(folder):
-        raise UserError(f"{folder} has no checkpoint to go on from: train again.")
-    recorder = Recorder(folder, None)
-    try:
-        agent, made = agent_of(recorder), task_of(recorder) if task is None else task
+    run = run if isinstance(run, Run) else Run(run)
+    folder, agent = run.folder, agent_of(run)
+    begins_again = not was_ever_written(folder) and not (folder / "results.json").exists()
+    if not (begins_again or listed(folder)):
+        raise UserError(f"{folder} has no checkpoint to go on from any more: train again, with another --out.")
+    with contextlib.ExitStack() as stack:
+        recorder = stack.enter_context(Recorder(folder, None))
+        made = task_of(recorder) if task is None else task
         before = _options(recorder)
         if steps is not None and steps < before["steps"]:
             raise UserError(f"steps={steps} is impossible: {folder} trains for {before['steps']}, and may only grow.")
         options = dataclasses.replace(Options(**before), **({} if steps is None else {"steps": steps}))
         trackers.check(options.track)
         recorder.amend({"options": dataclasses.asdict(options)}, provenance())
-    except BaseException:
-        recorder.close()
-        raise
-    training = _Training(recorder, agent, made, options, report)
-    return training.run(training.restore)
+        training = _Training(recorder, agent, made, options, report)
+        if begins_again:
+            training.begin_again()
+        stack.pop_all()
+    return training.run(None if begins_again else training.restore)
 
 
 def _options(run: Run) -> dict[str, Any]:
@@ -137,30 +142,37 @@ class _Training:
         self.last, self.saved_at = Progress(), time.monotonic()
         self.results = recorder.results()
         self.lost: set[int] = set()  # indices of the seeds that have diverged
-        self.requests = Requests()
+        self.step = 0
+        self.requests = Requests(partial(self._note, "stopping after this stretch; Ctrl-C again ends at once"))
 
     def run(self, restore: Callable[[Seed], Snapshot] | None = None) -> Run:
         """To the end, or until it is stopped."""
         try:
-            with self.requests:
-                for event in stages(self.agent, self.task, self.options, restore):
-                    self._listen(event)
-            self.checkpoints.close()
-            self.recorder.finish(self.results or {})
-            draw_curve(self.recorder)
+            with self.recorder:
+                self._train(restore)
         except BrokenPipeError:  # whoever was reading the reports has gone
             raise
         except OSError as error:
             raise UserError(
                 f"{self.recorder.folder} cannot be written ({error.strerror}): mend that, then "
-                f"`beliefrl resume {self.recorder.folder}` goes on from its last checkpoint."
+                f"`beliefrl resume {self.recorder.folder}` goes on."
             ) from None
-        finally:
-            self.checkpoints.abandon()
-            with contextlib.suppress(OSError):  # a full disk has been told already
-                self.recorder.note_end()
-            self.recorder.close()
         return self.recorder
+
+    def _train(self, restore: Callable[[Seed], Snapshot] | None) -> None:
+        try:
+            with self.checkpoints, self.requests:
+                for event in stages(self.agent, self.task, self.options, restore, self._note):
+                    self._listen(event)
+            self.recorder.finish(self.results or {})
+            draw_curve(self.recorder)
+        finally:
+            self.recorder.note_end()
+
+    def begin_again(self) -> None:
+        """Forget what was logged: there is nothing to go on from."""
+        self.recorder.rewind(dict.fromkeys(self.recorder.seeds, 0))
+        self._note("no checkpoint was written: begins again from step 0")
 
     def restore(self, shapes: Seed) -> Snapshot:
         """From the last good checkpoint; the log is cut back to what it was then."""
@@ -178,13 +190,18 @@ class _Training:
         return Snapshot(self.last, jax.tree.map(jnp.asarray, seeds))
 
     def _listen(self, event: Event) -> None:
+        self.step = event.step
         self._look_for_divergence(event)
         if event.evaluation is not None and self.lost:
-            event = event._replace(evaluation=_without(event.evaluation, self.lost))
-        self.results = _record(self.recorder, event, self.has_success, self.lost) or self.results
+            event = event._replace(evaluation=log.without(event.evaluation, self.lost))
+        self.results = log.record(self.recorder, event, self.has_success, self.lost) or self.results
         self.report(event)
         if event.snapshot is not None:
             self._consider(event.snapshot)
+
+    def _note(self, note: str) -> None:
+        """Tell the user something at once, whichever thread it comes from."""
+        self.report(Event("training", self.step, note=note))
 
     def _look_for_divergence(self, event: Event) -> None:
         """A seed whose losses or networks are not finite any more is lost; the others go on."""
@@ -194,7 +211,7 @@ class _Training:
         if event.snapshot is not None and self._is_due(event.snapshot):
             states = event.snapshot.seeds.state
         if states is not None:
-            self._lose(np.flatnonzero(~np.asarray(_finite(states))), event, "its networks are not finite")
+            self._lose(np.flatnonzero(~np.asarray(log.finite(states))), event, "its networks are not finite")
 
     def _lose(self, indices: np.ndarray, event: Event, why: str) -> None:
         for index in indices:
@@ -241,60 +258,3 @@ class _Training:
         progress = {"progress": list(snapshot.progress), "metrics": self.recorder.lengths(), "lost": lost}
         self.checkpoints.save(snapshot.progress.step, progress, rest, replay.moments, np.asarray(replay.added))
         self.last, self.saved_at = snapshot.progress, time.monotonic()
-
-
-@jax.jit
-def _finite(states: Any) -> Bool[Array, " seed"]:
-    """Whether all numbers of each seed's agent are finite."""
-    checks = [
-        jnp.all(jnp.isfinite(leaf), axis=tuple(range(1, leaf.ndim)))
-        for leaf in jax.tree.leaves(states)
-        if jnp.issubdtype(leaf.dtype, jnp.floating)
-    ]
-    return jnp.all(jnp.stack(checks), axis=0)
-
-
-def _without(evaluation: Episode, lost: Collection[int]) -> Episode:
-    """The same with no numbers of the seeds that are lost."""
-    total: Any = np.array(evaluation.total)
-    total[sorted(lost)] = np.nan
-    return evaluation._replace(total=total)
-
-
-def _record(recorder: Recorder, event: Event, has_success: bool, lost: Collection[int]) -> dict[str, Any] | None:
-    """Log what an event tells of every seed that is not lost; returns the summary of an evaluation."""
-    metrics = {name: np.asarray(values) for name, values in event.metrics.items()}
-    for index, seed in enumerate(recorder.seeds):
-        if index in lost:
-            continue
-        if metrics and event.part:
-            recorder.log(seed, "pretrain", event.part[0], {k: float(v[index]) for k, v in metrics.items()})
-        elif metrics:
-            recorder.log(seed, "update", event.step, {k: float(v[index]) for k, v in metrics.items()})
-        if event.episodes is not None:
-            episodes = jax.tree.map(lambda leaf, index=index: np.asarray(leaf[index]), event.episodes)
-            for end in np.flatnonzero(episodes.done):
-                recorder.log(seed, "episode", event.step, _episode(episodes, end, has_success))
-        if event.evaluation is not None:
-            result = jax.tree.map(lambda leaf, index=index: np.asarray(leaf[index]), event.evaluation)
-            recorder.log(seed, "evaluation", event.step, _evaluated(result, has_success))
-    if event.states is not None:
-        recorder.flush()
-        recorder.save(event.states, lost)
-    if event.evaluation is None:
-        return None
-    return {"step": event.step} | summary(event.evaluation, has_success)
-
-
-def _episode(episodes: Episode, end: Any, has_success: bool) -> dict[str, Any]:
-    success = {"success": bool(episodes.success[end])} if has_success else {}
-    return {"return": float(episodes.total[end]), "length": int(episodes.length[end])} | success
-
-
-def _evaluated(result: Episode, has_success: bool) -> dict[str, Any]:
-    values: dict[str, Any] = {}
-    for index, mode in enumerate(MODES):
-        values[mode] = [float(total) for total in result.total[index]]
-        if has_success:
-            values[f"{mode}_success"] = [bool(success) for success in result.success[index]]
-    return values

@@ -29,7 +29,9 @@ RUNS are runs, or folders that hold runs, such as a sweep's. `beliefrl figure KI
 class FigureOptions:
     """Draw a figure from finished runs, as PNG and PDF."""
 
-    runs: Annotated[tyro.conf.Positional[tuple[pathlib.Path, ...]], tyro.conf.arg(metavar="RUNS")]
+    runs: Annotated[
+        tyro.conf.Positional[tuple[pathlib.Path, ...]], tyro.conf.arg(metavar="RUNS", help_behavior_hint="(required)")
+    ]
     """Runs, or folders that hold runs, such as a sweep's."""
     out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """The file, without an ending or with .png or .pdf (scalability, table: .md or .tex). None: KIND in this folder."""

@@ -62,7 +62,9 @@ class VideoOptions:
 class FilmOptions:
     """Draw a film strip: frames of an episode, evenly spaced in time; a row for each run."""
 
-    runs: Annotated[tyro.conf.Positional[tuple[pathlib.Path, ...]], tyro.conf.arg(metavar="RUN")]
+    runs: Annotated[
+        tyro.conf.Positional[tuple[pathlib.Path, ...]], tyro.conf.arg(metavar="RUN", help_behavior_hint="(required)")
+    ]
     """The runs' folders."""
     out: pathlib.Path | None = None
     """The strip, written as PNG and as PDF. None: film.png in the first run's folder."""

@@ -14,7 +14,9 @@ from beliefrl.arguments import UsageError, parse
 class ReportOptions:
     """Put runs on one page for the browser: curves, final returns with intervals, settings, time; no network needed."""
 
-    runs: Annotated[tyro.conf.Positional[tuple[pathlib.Path, ...]], tyro.conf.arg(metavar="RUNS")]
+    runs: Annotated[
+        tyro.conf.Positional[tuple[pathlib.Path, ...]], tyro.conf.arg(metavar="RUNS", help_behavior_hint="(required)")
+    ]
     """Folders that are runs or hold runs, such as a sweep's."""
     out: Annotated[pathlib.Path, tyro.conf.arg(aliases=["-o"])] = pathlib.Path("report.html")
     """The page to write; one that is there is replaced. Its links to videos are relative to where it lies."""

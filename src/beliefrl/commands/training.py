@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import pathlib
 from collections.abc import Sequence
 from typing import Annotated, Any
@@ -13,7 +14,7 @@ from beliefrl.arguments import agent_name, agent_options, named_values, parse
 
 @dataclasses.dataclass(frozen=True)
 class ResumeOptions:
-    """Go on with a training from its last checkpoint, as if it had never stopped."""
+    """Go on with a training from its last checkpoint, as if it had never stopped; from step 0 where it has none yet."""
 
     run: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
@@ -26,7 +27,6 @@ def train(argv: Sequence[str]) -> None:
     from rich.console import Console
 
     from beliefrl import agents, runs, tasks
-    from beliefrl.checkpoint import listed
     from beliefrl.display import TrainingDisplay
     from beliefrl.schedule import Options
     from beliefrl.train import train as run_training
@@ -66,7 +66,7 @@ def train(argv: Sequence[str]) -> None:
             "out": (
                 Annotated[
                     pathlib.Path | None,
-                    tyro.conf.arg(help="The run's folder, which must not exist. None: runs/AGENT-TASK-1, or the next."),
+                    tyro.conf.arg(help="The run's folder, a new one. None: runs/AGENT-TASK-1, or the next."),
                 ],
                 None,
             ),
@@ -79,13 +79,10 @@ def train(argv: Sequence[str]) -> None:
     options = parse(options_type, rest, f"beliefrl train {name}")
     task = tasks.make(options.task, options.observe or None, **named_values(options.constants, "--constants"))
     console = Console()
-    if options.resume and options.out is not None and options.out.is_dir():
-        if (options.out / "config.json").exists():
-            _same_training(runs.Run(options.out), name, tasks.describe(task), options)
-        if listed(options.out):
-            _resume(options.out, options.training.steps)
-            return
-        runs.clear(options.out)
+    if options.resume and options.out is not None and os.path.exists(options.out / "config.json"):  # noqa: PTH110 - pathlib's raises where a name is too long
+        _same_training(runs.Run(options.out), name, tasks.describe(task), options)
+        _resume(options.out, options.training.steps)
+        return
     with TrainingDisplay(console, options.training.steps) as display:
         run = run_training(options.agent, task, options.out, display, **dataclasses.asdict(options.training))
     _ended(run)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from beliefrl.arrays import write_whole
 from beliefrl.sweeps.plan import Experiment, Training
-from beliefrl.types import UserError
+from beliefrl.types import UserError, said
 
 PLAN = "sweep.json"
 
@@ -32,7 +32,7 @@ def load(path: str | os.PathLike[str]) -> list[Experiment]:
     except UserError:
         raise
     except Exception as error:  # whatever a user's file may raise
-        raise UserError(f"{path} cannot be run: {type(error).__name__}: {error}.") from None
+        raise UserError(f"{path} cannot be run: {said(error)}.") from None
     found = getattr(module, "experiments", None)
     if not isinstance(found, list | tuple) or not all(isinstance(each, Experiment) for each in found):
         raise UserError(f"{path} makes no list `experiments` of beliefrl.Experiment: beliefrl.grid(...) gives one.")

@@ -13,8 +13,8 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from beliefrl.tasks.spaces import check_actions, flat_bounds, flat_size, limits, short
-from beliefrl.types import LARGEST, Spec, UserError, check_indices, check_range
+from beliefrl.tasks.spaces import check_actions, flat_bounds, flat_size, limits
+from beliefrl.types import LARGEST, Spec, UserError, check_indices, check_range, said, short
 
 ENDLESS = 10_000  # steps after which an episode without a time limit is taken for one that never ends
 
@@ -220,9 +220,3 @@ def _array(value: Any) -> np.ndarray:
         return np.asarray(value)
     except ValueError:  # rows of different lengths
         return np.empty(0, object)
-
-
-def said(error: BaseException) -> str:
-    """An exception on one line."""
-    text = " ".join(str(error).split())[:300].rstrip(".")
-    return f"{type(error).__name__}: {text}" if text else type(error).__name__

@@ -20,7 +20,7 @@ import gymnasium
 from gymnasium import error
 
 from beliefrl.tasks.gymnasium import GymnasiumTask
-from beliefrl.types import UserError
+from beliefrl.types import UserError, one_line, said
 
 PREFIX = "gym:"
 BULLET = "pybullet_envs_gymnasium"
@@ -129,7 +129,7 @@ def _import(package: str, id: str) -> None:
     except ModuleNotFoundError as found:
         raise UserError(_missing(id, found)) from None
     except Exception as found:  # whatever a stranger's module may raise
-        raise UserError(f"The module {package} cannot be imported: {type(found).__name__}: {found}.") from None
+        raise UserError(f"The module {package} cannot be imported: {said(found)}.") from None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,7 +160,7 @@ def _missing(id: str, found: Exception) -> str:
 
 
 def _first_sentence(found: Exception) -> str:
-    return " ".join(str(found).split()).split(". ")[0].rstrip(".")
+    return one_line(str(found)).split(". ")[0].rstrip(".")
 
 
 @contextlib.contextmanager

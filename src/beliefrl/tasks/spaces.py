@@ -7,7 +7,7 @@ import numpy as np
 from gymnasium import spaces
 from jaxtyping import Float, Int
 
-from beliefrl.types import UserError
+from beliefrl.types import UserError, short
 
 MOST_NUMBERS = 4_000  # in an observation: more are taken for an image
 FAR = 100  # widths of its declared range by which an observation may leave that range
@@ -89,9 +89,3 @@ def limits(space: Any, indices: Int[np.ndarray, " obs"]) -> tuple[Float[np.ndarr
     with np.errstate(over="ignore"):
         room = FAR * np.maximum(high - low, 1.0)
     return low - room, high + room
-
-
-def short(value: Any) -> str:
-    """An object on one line of at most 80 characters."""
-    text = " ".join(repr(value).split())
-    return text if len(text) <= 80 else f"{text[:77]}..."
