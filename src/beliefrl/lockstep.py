@@ -21,7 +21,6 @@ from beliefrl.tasks.gymnasium import Environment, Fault, GymnasiumTask
 from beliefrl.types import UserError
 
 HANDOVER = 5e-4  # seconds that giving a step to other processes costs, about
-PROCESSES = ("auto", "always", "never")
 
 
 class Answers(NamedTuple):

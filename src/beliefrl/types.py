@@ -6,6 +6,7 @@ Axis names in shapes, everywhere: `seed` (one training each), `batch` (windows),
 
 import dataclasses
 import numbers
+import typing
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -19,19 +20,23 @@ class UserError(Exception):
 
 
 LARGEST = 2**31 - 1  # integer in a compiled program
+WIDEST = 100_000  # layer or state of a network
 
 
 def check_range(settings: Any, names: Sequence[str], low: int, high: int = LARGEST) -> None:
     """Raise a UserError where a field of a dataclass, or an entry of a tuple there, is no number in [low, high].
 
-    Where the field is declared as int, it must be a whole number. NaN is in no range.
+    Where the field is declared as int, it must be a whole number; only where it is declared as a tuple, it may be one.
+    NaN is in no range, and True is no number.
     """
     declared = {field.name: field.type for field in dataclasses.fields(settings)}
     for name in names:
         value = getattr(settings, name)
         entries = value if isinstance(value, tuple) else (value,)
         whole = declared[name] in (int, tuple[int, ...])
-        numeric = all(isinstance(entry, numbers.Integral if whole else numbers.Real) for entry in entries)
+        kind = numbers.Integral if whole else numbers.Real
+        numeric = all(isinstance(entry, kind) and not isinstance(entry, bool) for entry in entries)
+        numeric &= isinstance(value, tuple) == (typing.get_origin(declared[name]) is tuple)
         if not entries or not numeric or not all(low <= entry <= high for entry in entries):
             too_large = numeric and any(entry > high for entry in entries)
             bounds = f"from {low} to {high}" if too_large or high < LARGEST else f"of at least {low}"
@@ -39,10 +44,12 @@ def check_range(settings: Any, names: Sequence[str], low: int, high: int = LARGE
             raise UserError(f"{name}={value} is impossible: it must be {number} {bounds}.")
 
 
-def check_choice(settings: object, name: str, choices: Sequence[str]) -> None:
+def check_choice(settings: object, name: str, choices: Sequence[str | bool]) -> None:
     """Raise a UserError where a field of `settings` is none of the choices."""
     if getattr(settings, name) not in choices:
-        raise UserError(f"{name}={getattr(settings, name)!r} is impossible: it must be {' or '.join(choices)}.")
+        raise UserError(
+            f"{name}={getattr(settings, name)!r} is impossible: it must be {' or '.join(map(str, choices))}."
+        )
 
 
 class Spec(NamedTuple):
