@@ -140,7 +140,10 @@ def is_summary(results: Any, seeds: int) -> bool:
         return True
     if not isinstance(results, dict) or not _is_step(results.get("step")):
         return False
-    return all(isinstance(results.get(mode), dict) and _is_mode(results[mode], seeds) for mode in ("sampled", "mode"))
+    modes = [results.get("sampled"), results.get("mode")]
+    if not all(isinstance(mode, dict) and _is_mode(mode, seeds) for mode in modes):
+        return False
+    return (modes[0]["success"] is None) == (modes[1]["success"] is None)
 
 
 def _is_mode(mode: Row, seeds: int) -> bool:
@@ -149,6 +152,8 @@ def _is_mode(mode: Row, seeds: int) -> bool:
         return False
     returns, rates = mode["seeds"], mode["seeds_success"]
     if not isinstance(returns, list) or len(returns) != seeds or not _is_number(mode["mean"]):
+        return False
+    if (rates is None) != (mode["success"] is None):
         return False
     if rates is not None and not (_are_numbers(rates) and len(rates) == seeds and _is_number(mode["success"])):
         return False
