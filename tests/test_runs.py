@@ -120,7 +120,7 @@ def test_a_missing_log_is_named_and_a_half_written_line_is_not(recorder):
     assert recorder.damage() == []
     (recorder.folder / "metrics" / "seed-3.jsonl").unlink()
     assert list(recorder.rows(3)) == recorder.last_rows(3) == []
-    assert "seed-3.jsonl is missing" in recorder.damage()[0]
+    assert "metrics lacks the log of seed 3" in recorder.damage()[0]
 
 
 def test_a_log_that_cannot_be_opened_is_refused(recorder):

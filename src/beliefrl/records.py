@@ -92,13 +92,11 @@ def last_rows(log: pathlib.Path, size: int = 32_768) -> list[Row]:
 
 
 def damage(log: pathlib.Path) -> str | None:
-    """A sentence on what is wrong with a log, None if nothing is.
+    """A sentence on the damaged lines of a log, None if it has none.
 
     Raises:
         UserError: the log cannot be read.
     """
-    if not log.exists():
-        return f"{log} is missing: its seed counts as one that has not begun."
     damaged = [number for number, row in lines(log) if row is None]
     if not damaged:
         return None

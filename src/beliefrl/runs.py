@@ -79,8 +79,12 @@ class Run:
         return (row for row in rows if row is not None and kind in (None, row["kind"]))
 
     def damage(self) -> list[str]:
-        """What is wrong with the logs: a sentence for each that is missing, or has damaged lines."""
-        found = (records.damage(self._metrics(seed)) for seed in self.seeds)
+        """What is wrong with the logs: a sentence for each that has damaged lines, and one if some are missing."""
+        found = [records.damage(self._metrics(seed)) for seed in self.seeds]
+        missing = [seed for seed in self.seeds if not self._metrics(seed).exists()]
+        if missing:
+            logs = f"the log of seed {missing[0]}" if len(missing) == 1 else f"the logs of {len(missing)} seeds"
+            found.append(f"{self.folder / 'metrics'} lacks {logs}: what has no log counts as not begun.")
         return [sentence for sentence in found if sentence is not None]
 
     def last_rows(self, seed: int) -> list[Row]:

@@ -105,7 +105,7 @@ def test_a_run_without_its_logs_is_still_a_run(tmp_path):
     shutil.rmtree(run.folder / "metrics")
     found = find([run.folder])
     assert len(found.runs) == 1
-    assert "seed-0.jsonl is missing" in found.damage[0]
+    assert "metrics lacks the log of seed 0" in found.damage[0]
 
 
 @pytest.mark.parametrize("name", ["missing", "empty", "x" * 300])
