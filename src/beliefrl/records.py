@@ -138,15 +138,15 @@ def is_summary(results: Any, seeds: int) -> bool:
         return True
     if not isinstance(results, dict) or not _is_step(results.get("step")):
         return False
-    modes = [results.get("sampled"), results.get("mode")]
-    if not all(isinstance(mode, dict) and _is_mode(mode, seeds) for mode in modes):
+    sampled, mode = results.get("sampled"), results.get("mode")
+    if not (_is_mode(sampled, seeds) and _is_mode(mode, seeds)):
         return False
-    return (modes[0]["success"] is None) == (modes[1]["success"] is None)
+    return (sampled["success"] is None) == (mode["success"] is None)
 
 
-def _is_mode(mode: Row, seeds: int) -> bool:
+def _is_mode(mode: Any, seeds: int) -> bool:
     """Whether it is what a summary says of one mode."""
-    if not {"mean", "sem", "seeds", "success", "seeds_success"} <= mode.keys():
+    if not isinstance(mode, dict) or not {"mean", "sem", "seeds", "success", "seeds_success"} <= mode.keys():
         return False
     returns, rates = mode["seeds"], mode["seeds_success"]
     if not isinstance(returns, list) or len(returns) != seeds or not _is_number(mode["mean"]):
