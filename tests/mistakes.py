@@ -194,13 +194,19 @@ MISTAKES = {
     "show missing": "no run folder missing",
     "show broken": "broken/config.json cannot be read",
     "show foreign": "no agent 'foreign'",
-    "show scribbled": "Line 2 of scribbled/metrics/seed-0.jsonl is damaged",
+    "show list": "list/config.json lacks",
+    "show crowded": "crowded/config.json cannot be used: seeds=1000000000 is impossible",
+    "show misshapen": "misshapen/results.json is damaged",
+    "show unlogged": "unlogged/metrics/seed-0.jsonl cannot be read",
     "show resultless": "resultless/results.json is damaged",
     "report": "RUNS is missing",
     "report missing": "no folder missing",
     "report there": "no run in there",
-    "report untrained broken": "broken/config.json cannot be read",
-    "report scribbled": "Line 2 of scribbled/metrics/seed-0.jsonl is damaged",
+    "report broken": "broken/config.json cannot be read",
+    "report broken crowded": "broken/config.json cannot be read",
+    "report unlogged": "unlogged/metrics/seed-0.jsonl cannot be read",
+    "figure curves broken": "broken/config.json cannot be read",
+    "figure table crowded": "seeds=1000000000 is impossible",
     "report untrained -o page.txt": "call it page.html",
     "report untrained --out missing/page.html": "no folder missing",
     "report untrained -o": "-o/--out needs a value",
@@ -210,6 +216,18 @@ MISTAKES = {
     "evaluate masked": "give indices from 0 to 0",
     "evaluate list": "list/config.json lacks",
     "evaluate binary": "binary/config.json cannot be read",
+    "evaluate crowded": "crowded/config.json cannot be used: seeds=1000000000 is impossible",
+    "evaluate wide": "wide/config.json cannot be used: d_size=1000000000 is impossible",
+    "evaluate nameless": "has no hyperparameter 'name'",
+    "predict crowded": "seeds=1000000000 is impossible",
+    "predict wide": "d_size=1000000000 is impossible",
+    "video crowded film.gif": "seeds=1000000000 is impossible",
+    "film crowded": "seeds=1000000000 is impossible",
+    "export crowded policy.jax": "seeds=1000000000 is impossible",
+    "export wide policy.jax": "d_size=1000000000 is impossible",
+    "resume crowded": "seeds=1000000000 is impossible",
+    "resume list": "list/config.json lacks",
+    "resume binary": "binary/config.json cannot be read",
     "evaluate untrained --json extra": "one argument too many",
 }
 
@@ -232,13 +250,19 @@ def prepare(folder):
         "unknown": json.dumps(config | {"task": "nowhere"}),
         "overset": json.dumps(config | {"hyperparameters": {"colour": 1}}),
         "masked": json.dumps(config | {"observe": [5]}),
-    } | dict.fromkeys(("untrained", "damaged", "scribbled", "resultless"), whole)
+        "crowded": json.dumps(config | {"options": config["options"] | {"seeds": 10**9}}),
+        "wide": json.dumps(config | {"hyperparameters": {"d_size": 10**9}}),
+        "nameless": json.dumps(config | {"hyperparameters": {"name": 5}}),
+    } | dict.fromkeys(("untrained", "damaged", "scribbled", "halved", "resultless", "misshapen", "unlogged"), whole)
     for name, content in contents.items():
         (folder / name / "metrics").mkdir(parents=True)
         (folder / name / "config.json").write_text(content)
     (folder / "damaged" / "agent.safetensors").write_bytes(b"nonsense")
     (folder / "damaged" / "checkpoints" / "damaged-000001-step-10").mkdir(parents=True)
     (folder / "scribbled" / "metrics" / "seed-0.jsonl").write_text('{"step": 1, "kind": "update"}\nhello\n')
+    (folder / "halved" / "checkpoints" / ".000001-step-10.tmp").mkdir(parents=True)
+    (folder / "unlogged" / "metrics" / "seed-0.jsonl").mkdir()
+    (folder / "misshapen" / "results.json").write_text('{"step": 10, "sampled": 5}')
     (folder / "resultless" / "results.json").write_text('{"step": 10')
     (folder / "there").mkdir()
     (folder / "there" / "file").write_text("keep me")

@@ -164,6 +164,21 @@ def test_a_page_is_there_whole_or_not_at_all(tmp_path, monkeypatch):
     assert page.read_text() == before
 
 
+def test_runs_that_cannot_be_read_and_damaged_lines_are_told(tmp_path):
+    good, bad = a_folder(tmp_path / "good", TWO_SEEDS), a_folder(tmp_path / "bad", TWO_SEEDS)
+    (bad / "config.json").write_bytes(b"\x00\xff")
+    log = good / "metrics" / "seed-0.jsonl"
+    log.write_text(f'{EVIL}\n{log.read_text()}{{"half')
+    sentences = []
+    page = told(tmp_path, note=sentences.append)
+    assert page["damage"] == sentences
+    assert "bad/config.json cannot be read" in sentences[0]
+    assert "Line 1 of" in sentences[1]
+    assert len(sentences) == 2
+    assert [run["folder"] for run in page["runs"]] == [str(good)]
+    assert page["groups"][0]["curves"]["sampled"]["seeds"] == [[1.5, 4.0], [1.5, 7.0]]
+
+
 @pytest.mark.parametrize(("out", "said"), [("page.txt", "call it"), ("missing/page.html", "no folder")])
 def test_a_page_that_cannot_be_written_is_refused(tmp_path, out, said):
     a_folder(tmp_path / "run", TWO_SEEDS)

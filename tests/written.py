@@ -35,7 +35,7 @@ def a_folder(
 
 def a_run(folder, seeds, steps=None, settings=None, updates=(), **rest):
     """The run in such a folder; it is finished, unless it has `steps` that none of its seeds has reached."""
-    last = max((rows[-1][0] for rows in seeds if rows), default=0)
+    last = max((rows[-1][0] for rows in seeds if rows), default=1)
     steps = last if steps is None else steps
     return Run(a_folder(folder, seeds, steps=steps, hyperparameters=settings or {}, updates=updates, **rest))
 

@@ -17,11 +17,12 @@ from beliefrl.environment import TaskEnvironment, register
 from beliefrl.episodes import Trajectory, play
 from beliefrl.evaluation import evaluate, task_of
 from beliefrl.films import film, video
+from beliefrl.options import Options
 from beliefrl.policy import Policy, load
 from beliefrl.prediction import Predictions, draw_predictions, predictions
 from beliefrl.report import write_report
 from beliefrl.runs import Run
-from beliefrl.schedule import Event, Options
+from beliefrl.schedule import Event
 from beliefrl.stop import Stopped
 from beliefrl.sweeps.plan import Experiment, grid
 from beliefrl.sweeps.run import SweepStatus, sweep

@@ -10,6 +10,7 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
+from rich.text import Text
 
 from beliefrl.checkpoint import listed
 from beliefrl.runs import Run
@@ -191,30 +192,34 @@ def results_table(results: dict[str, Any], seeds: list[int], title: str) -> Tabl
 
 def run_table(run: Run, agent: Any) -> Table:
     """What a run was made with, and how far it is."""
-    table = Table(title=str(run.folder), title_justify="left", show_header=False)
-    config, options = run.config, run.config["options"]
+    table = Table(title=Text(str(run.folder)), title_justify="left", show_header=False)
+
+    def add(name: str, value: str) -> None:
+        table.add_row(name, Text(value))  # brackets in it are no markup
+
+    config = run.config
     own = {field.name: field.default for field in dataclasses.fields(agent)}
     changed = [f"{name}={value}" for name, value in config["hyperparameters"].items() if _differs(value, own.get(name))]
     constants = [f"{name}={value}" for name, value in config["constants"].items()]
     observed = [] if config.get("observe") is None else [f"observe={' '.join(map(str, config['observe']))}"]
     steps = [max((row["step"] for row in run.rows(seed) if row["kind"] != "pretrain"), default=0) for seed in run.seeds]
-    table.add_row("agent", config["agent"])
-    table.add_row("settings", ", ".join(changed) or "the agent's defaults")
-    table.add_row("task", " ".join([config["task"], *constants, *observed]))
-    table.add_row("seeds", ", ".join(map(str, run.seeds)))
-    table.add_row("steps", f"{max(steps):,} of {options['steps']:,}")
+    add("agent", config["agent"])
+    add("settings", ", ".join(changed) or "the agent's defaults")
+    add("task", " ".join([config["task"], *constants, *observed]))
+    add("seeds", ", ".join(map(str, run.seeds)))
+    add("steps", f"{max(steps):,} of {run.options.steps:,}")
     for seed in run.seeds:
-        for row in run.rows(seed, "diverged"):
-            table.add_row("diverged", f"seed {seed} by step {row['step']:,}: {row['why']}")
-    table.add_row("checkpoints", ", ".join(path.name for path in listed(run.folder)) or "none")
+        for entry in run.rows(seed, "diverged"):
+            add("diverged", f"seed {seed} by step {entry['step']:,}: {entry.get('why', '?')}")
+    add("checkpoints", ", ".join(path.name for path in listed(run.folder)) or "none")
     for index, session in enumerate([config, *config.get("resumed", ())]):
         began = f"{session.get('started', '?')} to {session.get('ended', '?')}, {session.get('device', '?')}"
         versions = " ".join(f"{name} {version}" for name, version in session.get("versions", {}).items())
         table.add_section()
-        table.add_row("resumed" if index else "started", began)
-        table.add_row("command", " ".join(session.get("command", ())))
-        table.add_row("commit", str(session.get("git_commit")))
-        table.add_row("versions", versions)
+        add("resumed" if index else "started", began)
+        add("command", " ".join(map(str, session.get("command", ()))))
+        add("commit", str(session.get("git_commit")))
+        add("versions", versions)
     return table
 
 

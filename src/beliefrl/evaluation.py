@@ -1,6 +1,8 @@
 """What a trained agent is worth: returns over episodes and seeds, with sampled and with mode actions."""
 
+import contextlib
 import os
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -10,6 +12,7 @@ from jaxtyping import Array, Key
 from beliefrl import agents, tasks
 from beliefrl.agents import Agent
 from beliefrl.host_evaluation import Evaluation
+from beliefrl.options import MOST_EPISODES
 from beliefrl.phases import evaluate as evaluate_seed
 from beliefrl.rollout import Episode
 from beliefrl.runs import Run
@@ -18,7 +21,6 @@ from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.types import LARGEST, UserError, tuples
 
 MODES = ("sampled", "mode")  # how actions are chosen; the first axis of an evaluation's leaves behind seeds
-MOST_EPISODES = 100_000  # side by side
 
 
 def summary(result: Episode, has_success: bool) -> dict[str, Any]:
@@ -77,22 +79,34 @@ def agent_of(run: Run) -> Agent:
     """The agent of a run, before it was trained.
 
     Raises:
-        UserError: it is unknown here.
+        UserError: it is unknown here, or one of its settings is unknown or impossible.
     """
-    return agents.make(run.config["agent"], **tuples(run.config["hyperparameters"]))
+    with _naming(run):
+        return agents.make(run.config["agent"], **tuples(run.config["hyperparameters"]))
 
 
 def task_of(run: Run | str | os.PathLike[str]) -> Any:
     """The task that a run was trained on, as `make_task` makes it; a `gym:PACKAGE:ID` imports its package.
 
     Raises:
-        UserError: there is no such run, or it was trained on a task of your own, which cannot be found by a name.
+        UserError: there is no such run, one of its constants is impossible, or it was trained on a task of your own,
+            which cannot be found by a name.
     """
     run = run if isinstance(run, Run) else Run(run)
     name, constants = run.config["task"], tuples(run.config["constants"])
     if not tasks.knows(name):
         raise UserError(f"{run.folder} was trained on {name}, which is not a task of this library: pass task=.")
-    return tasks.make(name, run.config.get("observe"), **constants)
+    with _naming(run):
+        return tasks.make(name, **constants | {"observe": run.config.get("observe")})
+
+
+@contextlib.contextmanager
+def _naming(run: Run) -> Iterator[None]:
+    """A UserError about what the run's config.json says names that file."""
+    try:
+        yield
+    except UserError as error:
+        raise UserError(f"{run.folder / 'config.json'} cannot be used: {error}") from None
 
 
 def evaluate(

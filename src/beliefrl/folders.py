@@ -8,6 +8,7 @@ import re
 import shutil
 from typing import Any
 
+from beliefrl import records
 from beliefrl.arrays import write_whole
 from beliefrl.types import UserError
 
@@ -93,20 +94,9 @@ def locked(folder: pathlib.Path, doing: str) -> Any:
     return file
 
 
-def is_complete(config: Any) -> bool:
-    """Whether a config.json holds what is read from it."""
-    kinds = {"agent": str, "hyperparameters": dict, "task": str, "constants": dict, "options": dict}
-    if not isinstance(config, dict) or not all(isinstance(config.get(key), kind) for key, kind in kinds.items()):
-        return False
-    return all(isinstance(config["options"].get(key), int) for key in ("seed", "seeds"))
-
-
 def _is_of_training(folder: pathlib.Path) -> bool:
     """Whether a training wrote the config.json there."""
-    try:
-        return is_complete(json.loads((folder / "config.json").read_text()))
-    except (OSError, ValueError):
-        return False
+    return records.is_complete(records.parsed(folder / "config.json"))
 
 
 def free_folder(name: str, parent: str = "runs") -> pathlib.Path:

@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -24,7 +24,6 @@ from beliefrl.types import UserError
 
 HANDOVER = 5e-4  # seconds that giving a step to other processes costs, about
 SLOW = 60.0  # seconds after which a call that has not returned is reported
-Processes = Literal["auto", "always", "never"]
 
 
 class Answers(NamedTuple):

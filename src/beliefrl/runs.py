@@ -8,9 +8,11 @@
     curve.png             the learning curve
 
 Lines are written out one by one, so a killed training loses at most the line it was writing, which `rows` skips.
+Whatever is read is checked as it is read (`records`), so nobody has to check it again.
 """
 
 import contextlib
+import dataclasses
 import json
 import os
 import pathlib
@@ -19,14 +21,14 @@ from typing import Any
 
 import numpy as np
 
-from beliefrl import arrays, trackers
+from beliefrl import arrays, records, trackers
 from beliefrl.arrays import write_whole
-from beliefrl.folders import is_complete, locked, make, write_config
+from beliefrl.folders import locked, make, write_config
+from beliefrl.options import Options
 from beliefrl.provenance import now
+from beliefrl.records import Row
 from beliefrl.trackers import Tracker
-from beliefrl.types import UserError
-
-Row = dict[str, Any]
+from beliefrl.types import UserError, tuples
 
 
 class Run:
@@ -36,7 +38,7 @@ class Run:
         """Open a folder that a training made.
 
         Raises:
-            UserError: it does not exist, no training made it, or it is no path.
+            UserError: it does not exist, no training made it, its config.json is damaged, or it is no path.
         """
         if not isinstance(folder, str | os.PathLike):
             raise UserError(f"{folder!r} is not a run: give a run, or the path of its folder.")
@@ -44,16 +46,24 @@ class Run:
         if not os.path.isdir(self.folder):  # noqa: PTH112 - pathlib's raises where a name is too long
             raise UserError(f"There is no run folder {self.folder}: give the --out of a training.")
         path = self.folder / "config.json"
-        try:
-            self.config: dict[str, Any] = json.loads(path.read_text())
-        except FileNotFoundError:
-            raise UserError(
-                f"{self.folder} is not a run: it has no config.json; give the --out of a training."
-            ) from None
-        except (OSError, ValueError):
-            raise UserError(f"{path} cannot be read as JSON: restore it, or train again.") from None
-        if not is_complete(self.config):
+        if not path.exists():
+            raise UserError(f"{self.folder} is not a run: it has no config.json; give the --out of a training.")
+        self.config: dict[str, Any] = records.parsed(path)
+        if self.config is None:
+            raise UserError(f"{path} cannot be read as JSON: restore it, or train again.")
+        if not records.is_complete(self.config):
             raise UserError(f"{path} lacks what a training writes there: restore it, or train again.")
+        try:
+            _ = self.options
+        except UserError as error:
+            raise UserError(f"{path} cannot be used: {error}") from None
+
+    @property
+    def options(self) -> Options:
+        """The options of the training; those that only another version has are left out."""
+        known = {field.name for field in dataclasses.fields(Options)}
+        given = tuples(self.config["options"])
+        return Options(**{name: value for name, value in given.items() if name in known})
 
     @property
     def seeds(self) -> list[int]:
@@ -62,31 +72,30 @@ class Run:
         return list(range(first, first + count))
 
     def rows(self, seed: int, kind: str | None = None) -> Iterator[Row]:
-        """The log of a seed in the order it was written; of one kind, if given.
+        """The log of a seed in the order it was written; of one kind, if given. Damaged lines are left out.
 
         Raises:
-            UserError: a line is not what a training writes.
+            UserError: the log cannot be read.
         """
-        path = self._metrics(seed)
-        if not path.exists():
-            return
-        with path.open(errors="replace") as lines:
-            for number, line in enumerate(lines, 1):
-                if line.endswith("\n"):
-                    row = _parsed(line, f"Line {number} of {path}", ("step", "kind"))
-                    if kind in (None, row["kind"]):
-                        yield row
+        rows = (row for _, row in records.lines(self._metrics(seed)))
+        return (row for row in rows if row is not None and kind in (None, row["kind"]))
 
-    def last_rows(self, seed: int, size: int = 32_768) -> list[Row]:
-        """The entries in the last `size` bytes of a seed's log, of a run that may be going on."""
-        path = self._metrics(seed)
-        if not path.exists():
-            return []
-        with path.open("rb") as file:
-            file.seek(max(0, path.stat().st_size - size))
-            lines = file.read().decode(errors="replace").split("\n")
-        whole = lines[:-1] if path.stat().st_size <= size else lines[1:-1]
-        return [_parsed(line, str(path), ("step", "kind")) for line in whole]
+    def damage(self) -> list[str]:
+        """What is wrong with the logs: a sentence for each that has damaged lines, and one if some are missing."""
+        found = [records.damage(self._metrics(seed)) for seed in self.seeds]
+        missing = [seed for seed in self.seeds if not self._metrics(seed).exists()]
+        if missing:
+            logs = f"the log of seed {missing[0]}" if len(missing) == 1 else f"the logs of {len(missing)} seeds"
+            found.append(f"{self.folder / 'metrics'} lacks {logs}: what has no log counts as not begun.")
+        return [sentence for sentence in found if sentence is not None]
+
+    def last_rows(self, seed: int) -> list[Row]:
+        """The last entries of a seed's log, of a run that may be going on.
+
+        Raises:
+            UserError: the log cannot be read.
+        """
+        return records.last_rows(self._metrics(seed))
 
     def _metrics(self, seed: int) -> pathlib.Path:
         return self.folder / "metrics" / f"seed-{seed}.jsonl"
@@ -98,7 +107,12 @@ class Run:
             UserError: it is not what a training writes.
         """
         path = self.folder / "results.json"
-        return _parsed(path.read_text(errors="replace"), str(path), ()) if path.exists() else None
+        if not path.exists():
+            return None
+        results = records.parsed(path)
+        if not records.is_summary(results, len(self.seeds)):
+            raise UserError(f"{path} is damaged: restore it from a copy, or remove it.")
+        return results
 
     def load(self, like: Any) -> Any:
         """The saved agents, in a tree of the structure, shapes and types of `like`.
@@ -233,14 +247,3 @@ def _tell(told: list[Tracker], kind: str, step: int, values: Row) -> None:
     }
     for tracker in told:
         tracker.log(step, numbers)
-
-
-def _parsed(text: str, what: str, keys: tuple[str, ...]) -> Row:
-    """An object of JSON with these keys; an empty one will do."""
-    try:
-        row = json.loads(text)
-    except ValueError:
-        row = None
-    if not isinstance(row, dict) or (row and not all(key in row for key in keys)):
-        raise UserError(f"{what} is damaged: restore it from a copy, or remove it.")
-    return row

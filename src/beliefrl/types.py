@@ -40,6 +40,7 @@ def short(value: Any) -> str:
 
 ESCAPES = re.compile(r"(?:\x1b\[|\x9b)[0-?]*[ -/]*[@-~]|\x1b\].*?(?:\x07|\x1b\\)", re.DOTALL)  # colours, titles, links
 LARGEST = 2**31 - 1  # integer in a compiled program
+WIDEST = 100_000  # layer or state of a network
 
 
 def check_range(settings: Any, names: Sequence[str], low: int | float, high: int | float = LARGEST) -> None:
@@ -88,10 +89,12 @@ def tuples(values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
 
 
-def check_choice(settings: object, name: str, choices: Sequence[str]) -> None:
+def check_choice(settings: object, name: str, choices: Sequence[str | bool]) -> None:
     """Raise a UserError where a field of `settings` is none of the choices."""
     if getattr(settings, name) not in choices:
-        raise UserError(f"{name}={getattr(settings, name)!r} is impossible: it must be {' or '.join(choices)}.")
+        raise UserError(
+            f"{name}={getattr(settings, name)!r} is impossible: it must be {' or '.join(map(str, choices))}."
+        )
 
 
 class Spec(NamedTuple):

@@ -1,6 +1,7 @@
 """Runs put together: what belongs to one line of a figure, and what does not."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -83,9 +84,28 @@ def test_runs_are_found_however_deep(tmp_path):
     a_run(tmp_path / "sweep" / "vrm-seed0", [flat(1.0)])
     a_run(tmp_path / "sweep" / "deep" / "vrm-seed1", [flat(1.0)], first=1)
     (tmp_path / "sweep" / "config.json").write_text("not a run's")
-    both = find([tmp_path / "sweep"])
+    both = find([tmp_path / "sweep"]).runs
     assert [run.folder.name for run in both] == ["vrm-seed1", "vrm-seed0"]
-    assert len(find([tmp_path / "sweep", tmp_path / "sweep" / "vrm-seed0"])) == 2
+    assert len(find([tmp_path / "sweep", tmp_path / "sweep" / "vrm-seed0"]).runs) == 2
+
+
+def test_a_run_that_cannot_be_read_is_left_out_and_named(tmp_path):
+    good, bad = a_run(tmp_path / "good", [flat(1.0)]).folder, a_run(tmp_path / "bad", [flat(1.0)]).folder
+    (bad / "config.json").write_text("{")
+    found = find([good, bad])
+    assert [run.folder for run in found.runs] == [good]
+    (why,) = found.damage
+    assert f"{bad}/config.json cannot be read" in why
+    with pytest.raises(UserError, match="cannot be read"):
+        find([bad])
+
+
+def test_a_run_without_its_logs_is_still_a_run(tmp_path):
+    run = a_run(tmp_path / "run", [flat(1.0)])
+    shutil.rmtree(run.folder / "metrics")
+    found = find([run.folder])
+    assert len(found.runs) == 1
+    assert "metrics lacks the log of seed 0" in found.damage[0]
 
 
 @pytest.mark.parametrize("name", ["missing", "empty", "x" * 300])

@@ -53,7 +53,5 @@ def test_what_is_not_known_is_said_to_be_unknown(tmp_path):
 
 
 def test_sessions_that_are_no_sessions_have_no_time(tmp_path):
-    for index, resumed in enumerate((5, "words")):
-        sessions = {**SESSIONS, "resumed": resumed}
-        assert wall_clock(a_run(tmp_path / f"{index}", [flat(1.0)], **sessions)) == 60
-    assert wall_clock(a_run(tmp_path / "other", [flat(1.0)], **{**SESSIONS, "resumed": [5]})) is None
+    for index, session in enumerate(({}, {"started": 5, "ended": 6}, {"started": "today", "ended": "later"})):
+        assert wall_clock(a_run(tmp_path / f"{index}", [flat(1.0)], **{**SESSIONS, "resumed": [session]})) is None

@@ -145,7 +145,7 @@ def find(name: str) -> Any:
     return AGENTS[name].agent
 
 
-def make(name: str, **hyperparameters: Any) -> Agent:
+def make(name: str, /, **hyperparameters: Any) -> Agent:
     """The agent of that name; `hyperparameters` replace its defaults.
 
     Raises:

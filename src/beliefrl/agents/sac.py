@@ -19,7 +19,7 @@ from beliefrl.soft_actor_critic import (
     loss,
     update,
 )
-from beliefrl.types import LARGEST, check_range
+from beliefrl.types import LARGEST, WIDEST, check_choice, check_range
 
 MOST_STEPS = 64  # of a return; each is compiled
 Metrics = dict[str, Float[Array, ""]]
@@ -60,7 +60,8 @@ class SAC:
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
-        check_range(self, ("train_interval_rl", "updates_per_step", "policy_layers", "value_layers"), 1)
+        check_range(self, ("train_interval_rl", "updates_per_step"), 1)
+        check_range(self, ("policy_layers", "value_layers"), 1, WIDEST)
         check_range(self, ("n_step",), 1, MOST_STEPS)
         check_range(self, ("value_start",), -LARGEST)
         check_range(self, ("actor_regulariser",), 0)
@@ -68,6 +69,9 @@ class SAC:
         check_range(self, ("lr_actor", "lr_critic", "lr_alpha", "gamma", "tau"), 0, 1)
         if self.target_entropy is not None:
             check_range(self, ("target_entropy",), -LARGEST)
+        for field in dataclasses.fields(self):
+            if field.type is bool:
+                check_choice(self, field.name, (True, False))
 
     @property
     def cycle_updates(self) -> int:

@@ -20,7 +20,7 @@ from beliefrl.agents.sac import SAC, Metrics, for_each_update, split_updates
 from beliefrl.nets import LSTM, LSTMState, descend, draw
 from beliefrl.returns import transition_batch
 from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState, soft_update, update
-from beliefrl.types import Spec, Step, Window, WindowShape, check_range, time_major, transitions
+from beliefrl.types import WIDEST, Spec, Step, Window, WindowShape, check_range, time_major, transitions
 
 
 class State(NamedTuple):
@@ -57,7 +57,8 @@ class SACLSTMAgent(SAC):
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
         super().__post_init__()
-        check_range(self, ("seq_len", "batch_size", "d_size"), 1)
+        check_range(self, ("seq_len", "batch_size"), 1)
+        check_range(self, ("d_size",), 1, WIDEST)
         check_range(self, ("burn_in", "pretrain_updates"), 0)
         check_range(self, ("lr_lstm",), 0, 1)
 

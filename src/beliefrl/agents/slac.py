@@ -24,6 +24,7 @@ from beliefrl.nets import Gaussian, descend, draw
 from beliefrl.returns import transition_batch
 from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean
 from beliefrl.types import (
+    WIDEST,
     Spec,
     Step,
     UserError,
@@ -74,8 +75,8 @@ class SLACAgent(SAC):
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
         super().__post_init__()
-        sizes = ("seq_len", "batch_size", "history", "z1_size", "z2_size", "model_layers", "train_interval_model")
-        check_range(self, sizes, 1)
+        check_range(self, ("seq_len", "batch_size", "train_interval_model"), 1)
+        check_range(self, ("history", "z1_size", "z2_size", "model_layers"), 1, WIDEST)
         check_range(self, ("pretrain_updates",), 0)
         check_range(self, ("lr_model",), 0, 1)
         check_choice(self, "elbo_scaling", ("mean", "sum"))

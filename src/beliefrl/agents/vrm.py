@@ -26,6 +26,7 @@ from beliefrl.nets import Gaussian, LSTMState, Scale, descend, draw, standardise
 from beliefrl.returns import transition_batch
 from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean
 from beliefrl.types import (
+    WIDEST,
     Spec,
     Step,
     UserError,
@@ -110,7 +111,8 @@ class VRMAgent(SAC):
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
         super().__post_init__()
-        check_range(self, ("seq_len", "batch_size", "train_interval_klvrm", "d_size", "z_size", "hidden_size"), 1)
+        check_range(self, ("seq_len", "batch_size", "train_interval_klvrm"), 1)
+        check_range(self, ("d_size", "z_size", "hidden_size"), 1, WIDEST)
         check_range(self, ("burn_in", "train_times_fivrm"), 0)
         check_range(self, ("lr_model",), 0, 1)
         check_choice(self, "models", ("both", "single", "first", "keep"))

@@ -2,7 +2,7 @@
 
 import os
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -58,27 +58,48 @@ class Group:
         return any("sampled_success" in row for rows in self.evaluations for row in rows)
 
 
-def find(paths: Sequence[str | os.PathLike[str]]) -> list[Run]:
+class Found(NamedTuple):
+    """The runs in some folders, and what is wrong with others there."""
+
+    runs: list[Run]
+    damage: list[str]  # a sentence for each run that cannot be read, and for each log with damaged lines
+
+
+def find(paths: Sequence[str | os.PathLike[str]], opened: Callable[[pathlib.Path], Run] = Run) -> Found:
     """The runs in these folders, which are runs themselves or hold any number of them, however deep.
 
+    A run that cannot be read is left out. `opened` opens a run's folder.
+
     Raises:
-        UserError: a folder does not exist, holds no run, or a run in it cannot be read.
+        UserError: a folder does not exist, holds no run, or none of the runs can be read.
     """
     found: dict[pathlib.Path, Run] = {}
+    unreadable: dict[pathlib.Path, str] = {}
+    logs: list[str] = []
     for path in map(pathlib.Path, paths):
         if not os.path.isdir(path):  # noqa: PTH112 - pathlib's raises where a name is too long
             raise UserError(f"There is no folder {path}: give the --out of a training or of a sweep.")
         inside = sorted(config.parent for config in path.rglob("config.json") if (config.parent / "metrics").is_dir())
-        if not inside:
+        if not (inside or (path / "config.json").exists()):
             raise UserError(f"There is no run in {path}: give the --out of a training or of a sweep.")
-        found |= {folder.resolve(): Run(folder) for folder in inside}
-    return list(found.values())
+        for folder in inside or [path]:
+            known = folder.resolve()
+            if known in found or known in unreadable:
+                continue
+            try:
+                run = opened(folder)
+                logs += run.damage()
+                found[known] = run
+            except UserError as error:
+                unreadable[known] = str(error)
+    if unreadable and not found:
+        raise UserError(next(iter(unreadable.values())))
+    return Found(list(found.values()), [*unreadable.values(), *logs])
 
 
 def is_finished(run: Run) -> bool:
     """Whether every seed has been evaluated at the last step, or has diverged."""
-    steps = run.config["options"].get("steps", 0)
-    return all(_diverged(run, seed) or last_step(run, seed) >= steps for seed in run.seeds)
+    return all(_diverged(run, seed) or last_step(run, seed) >= run.options.steps for seed in run.seeds)
 
 
 def last_step(run: Run, seed: int) -> int:

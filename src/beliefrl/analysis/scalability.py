@@ -26,8 +26,8 @@ class Cost(NamedTuple):
 
 def wall_clock(run: Run) -> float | None:
     """Seconds that a run's sessions took together; None where one was killed, so that nobody knows its end."""
-    total, resumed = 0.0, run.config.get("resumed")
-    for session in (run.config, *(resumed if isinstance(resumed, list) else ())):
+    total = 0.0
+    for session in (run.config, *run.config.get("resumed", ())):
         try:
             began, ended = (datetime.fromisoformat(session[name]) for name in ("started", "ended"))
             total += (ended - began).total_seconds()

@@ -55,7 +55,7 @@ def figure(argv: Sequence[str]) -> None:
         raise UsageError(f"{given}: write beliefrl figure KIND RUNS, where KIND is {', '.join(KINDS)}.")
     kind = argv[0]
     options = parse(FigureOptions, argv[1:], f"beliefrl figure {kind}")
-    groups, left_out = _groups(options, kind)
+    groups, notes = _groups(options, kind)
     out = options.out or pathlib.Path(kind)
 
     from beliefrl.analysis import aggregate, elbo, final, panels, scalability
@@ -72,13 +72,13 @@ def figure(argv: Sequence[str]) -> None:
         path = panels.draw_curves(panels.pooled(groups, presets.drawn, presets.PAPERS), out, options.actions)
     else:
         path = panels.draw_curves(groups, out, options.actions)
-    for folder in left_out:
-        print(f"left out: {folder} is not finished (--unfinished draws it as far as it has come)")
+    for note in notes:
+        print(note)
     print(f"written to {path} and {path.with_suffix('.tex' if kind in TABLES else '.pdf').name}")
 
 
-def _groups(options: FigureOptions, kind: str) -> tuple[list, list[pathlib.Path]]:
-    """The chosen runs' lines, and the folders of those that were left out."""
+def _groups(options: FigureOptions, kind: str) -> tuple[list, list[str]]:
+    """The chosen runs' lines, and a sentence for each file that is damaged and each run that is left out."""
     from beliefrl import agents
     from beliefrl.analysis import groups
     from beliefrl.types import UserError
@@ -86,11 +86,16 @@ def _groups(options: FigureOptions, kind: str) -> tuple[list, list[pathlib.Path]
     if not options.runs:
         raise UsageError("RUNS is missing: give runs, or folders that hold runs, such as a sweep's.")
     found = groups.find(options.runs)
-    chosen = [run for run in found if not options.tasks or run.config["task"] in options.tasks]
+    chosen = [run for run in found.runs if not options.tasks or run.config["task"] in options.tasks]
     chosen = [run for run in chosen if not options.agents or run.config["agent"] in options.agents]
     if kind == "ablation":
         chosen = [run for run in chosen if run.config["agent"].startswith("vrm")]
     drawn = [run for run in chosen if options.unfinished or groups.is_finished(run)]
     if not drawn:
-        raise UserError(f"None of the {len(found)} runs can be drawn: none that was asked for is finished.")
-    return groups.groups(drawn, agents.defaults()), [run.folder for run in chosen if run not in drawn]
+        raise UserError(f"None of the {len(found.runs)} runs can be drawn: none that was asked for is finished.")
+    unfinished = [
+        f"left out: {run.folder} is not finished (--unfinished draws it as far as it has come)"
+        for run in chosen
+        if run not in drawn
+    ]
+    return groups.groups(drawn, agents.defaults()), [f"damaged: {why}" for why in found.damage] + unfinished

@@ -31,4 +31,5 @@ def report(argv: Sequence[str]) -> None:
         raise UsageError("RUNS is missing; `beliefrl report --help` shows what can be given.")
     from beliefrl.report import write_report
 
-    print(f"written to {write_report(options.runs, options.out, options.unfinished)}: open it in a browser")
+    path = write_report(options.runs, options.out, options.unfinished, lambda sentence: print(f"damaged: {sentence}"))
+    print(f"written to {path}: open it in a browser")

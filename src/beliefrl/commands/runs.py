@@ -59,6 +59,8 @@ def show(argv: Sequence[str]) -> None:
     console.print(table)
     if results:
         console.print(results_table(results, run.seeds, f"after {results['step']:,} steps"))
+    for sentence in run.damage():
+        console.print(f"damaged: {sentence}", markup=False, highlight=False, soft_wrap=True)
 
 
 def evaluate(argv: Sequence[str]) -> None:

@@ -75,7 +75,7 @@ def sweep(argv: Sequence[str]) -> None:
 
 def _experiments(options: SweepOptions) -> list:
     """What the command line asks for."""
-    from beliefrl.schedule import Options
+    from beliefrl.options import Options
     from beliefrl.sweeps import files, plan, presets
     from beliefrl.types import check_range
 

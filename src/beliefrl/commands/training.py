@@ -28,7 +28,7 @@ def train(argv: Sequence[str]) -> None:
 
     from beliefrl import agents, runs, tasks
     from beliefrl.display import TrainingDisplay
-    from beliefrl.schedule import Options
+    from beliefrl.options import Options
     from beliefrl.train import train as run_training
 
     name, rest = agent_name(argv, "train", "TASK")
@@ -127,5 +127,5 @@ def _resume(folder: pathlib.Path, steps: int | None) -> None:
     from beliefrl.train import resume as go_on
 
     run = Run(folder)
-    with TrainingDisplay(Console(), steps or run.config["options"]["steps"]) as display:
+    with TrainingDisplay(Console(), steps or run.options.steps) as display:
         _ended(go_on(run, steps, report=display))

@@ -12,7 +12,7 @@ import html
 import json
 import os
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from importlib import metadata, resources
 from string import Template
@@ -25,28 +25,38 @@ from beliefrl.types import UserError
 
 
 def write_report(
-    paths: Sequence[str | os.PathLike[str]], out: str | os.PathLike[str] = "report.html", unfinished: bool = False
+    paths: Sequence[str | os.PathLike[str]],
+    out: str | os.PathLike[str] = "report.html",
+    unfinished: bool = False,
+    note: Callable[[str], None] | None = None,
 ) -> pathlib.Path:
     """Write the report of all runs in these folders; returns the page's path. A page that is there is replaced.
+
+    A run that cannot be read is left out, and so are damaged lines of a log; the page says so.
 
     Args:
         paths: folders that are runs or hold runs, however deep.
         out: the page, NAME.html. Links to videos and pictures are relative to where it lies.
         unfinished: runs that are not finished count as well.
+        note: called with a sentence for each run that cannot be read, and for each log with damaged lines.
 
     Raises:
-        UserError: there is no run in a folder, a run cannot be read, or the page cannot be written.
+        UserError: there is no run in a folder, none of the runs can be read, or the page cannot be written.
     """
     out = pathlib.Path(out)
     if out.suffix not in (".html", ".htm"):
         raise UserError(f"The report is a page, which {out} is not called like: call it {out.with_suffix('.html')}.")
     if not os.path.isdir(out.parent):  # noqa: PTH112 - pathlib's raises where a name is too long
         raise UserError(f"There is no folder {out.parent} to write {out.name} into: make it, or choose another --out.")
-    content = page(told([ReadOnce(run.folder) for run in find(paths)], out.parent, unfinished))
+    found = find(paths, ReadOnce)
+    content = page(told(found.runs, out.parent, unfinished) | {"damage": found.damage})
     try:
         write_whole(out, content.encode())
     except OSError as error:
         raise UserError(f"{out} cannot be written ({error.strerror}): choose another --out.") from None
+    if note is not None:
+        for sentence in found.damage:
+            note(sentence)
     return out
 
 

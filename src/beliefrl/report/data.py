@@ -120,7 +120,7 @@ def number(value: float) -> float | None:
 
 def _run(run: Run, beside: pathlib.Path, groups_of: dict[int, int | None]) -> dict[str, Any]:
     config = run.config
-    sessions = [each for each in (config, *_list(config.get("resumed"))) if isinstance(each, dict)]
+    sessions = [config, *config.get("resumed", ())]
     steps = {seed: last_step(run, seed) for seed in run.seeds}
     return {
         "folder": str(run.folder),
@@ -131,7 +131,7 @@ def _run(run: Run, beside: pathlib.Path, groups_of: dict[int, int | None]) -> di
         "finished": is_finished(run),
         "seeds": run.seeds,
         "steps": max(steps.values(), default=0),
-        "of": config["options"].get("steps"),
+        "of": run.options.steps,
         "diverged": [f"seed {seed}: {row.get('why')}" for seed in run.seeds for row in run.rows(seed, "diverged")],
         "seconds": wall_clock(run),
         "settings": settings(config),
@@ -153,19 +153,14 @@ def settings(config: dict[str, Any]) -> list[str] | None:
 
 def _session(session: dict[str, Any]) -> dict[str, str]:
     """How a training was started or gone on with, in words."""
-    versions = session.get("versions")
     return {
         "started": str(session.get("started", "?")),
         "ended": str(session.get("ended", "?")),
         "device": str(session.get("device", "?")),
         "commit": str(session.get("git_commit") or "?"),
-        "command": shlex.join(map(str, _list(session.get("command")))),
-        "versions": ", ".join(f"{name} {of}" for name, of in versions.items()) if isinstance(versions, dict) else "?",
+        "command": shlex.join(map(str, session.get("command", ()))),
+        "versions": ", ".join(f"{name} {of}" for name, of in session.get("versions", {}).items()) or "?",
     }
-
-
-def _list(value: Any) -> list[Any]:
-    return value if isinstance(value, list) else []
 
 
 def _media(folder: pathlib.Path) -> list[pathlib.Path]:

@@ -195,6 +195,8 @@ table(at("unfinished"), UNFINISHED, late);
 at("unfinished-note").textContent = late.some((run) => run.group != null)
   ? "They count in the curves and the table above, as far as they are."
   : "Left out of the curves and the table above.";
+at("damage-section").hidden = !data.damage.length;
+at("damage").append(...data.damage.map((sentence) => html("li", {}, sentence)));
 
 function update() {
   const view = shown();

@@ -139,7 +139,7 @@ def _spaced(indices: tuple[int, ...]) -> str:
     return ", ".join(map(str, indices))
 
 
-def make(name: str, observe: Sequence[int | str] | int | str | None = None, **constants: Any) -> Any:
+def make(name: str, /, observe: Sequence[int | str] | int | str | None = None, **constants: Any) -> Any:
     """The task of that name.
 
     "pendulum-v" is pendulum with velocities only, "pendulum-p" (positions) without velocities. "gym:ID" is any
@@ -199,7 +199,7 @@ def _indices(name: str, observe: Sequence[int | str] | int | str) -> tuple[int, 
         return velocities if given[0] == "velocities" else positions
     try:
         return tuple(int(str(entry)) for entry in given)  # int(1.5) is 1
-    except ValueError:
+    except (TypeError, ValueError, OverflowError):
         raise UserError(
             f"observe={' '.join(map(str, given))} cannot be understood: give indices, or velocities, or positions."
         ) from None

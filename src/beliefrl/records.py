@@ -1,0 +1,154 @@
+"""The JSON in a run's folder: logs line by line, and checks that what is read is what a training writes.
+
+A damaged file must end in one sentence wherever it is read, so what readers rely on is checked here: keys and types.
+The ranges of options are in `Options`, those of settings in the agents.
+"""
+
+import json
+import pathlib
+from collections.abc import Iterator
+from typing import Any
+
+from beliefrl.types import LARGEST, UserError
+
+Row = dict[str, Any]
+
+
+def parsed(path: pathlib.Path) -> Any:
+    """The content of a file of JSON; None if it cannot be read."""
+    try:
+        return _json(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+
+
+def _json(text: str) -> Any:
+    """What a text of JSON says; None if it is none."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+
+
+def is_complete(config: Any) -> bool:
+    """Whether a config.json holds what is read from it; the values of its options apart."""
+    kinds = {"agent": str, "hyperparameters": dict, "task": str, "constants": dict, "options": dict}
+    if not isinstance(config, dict) or not all(isinstance(config.get(key), kind) for key, kind in kinds.items()):
+        return False
+    if not ({"seed", "seeds"} <= config["options"].keys() and isinstance(config.get("observe"), list | None)):
+        return False
+    resumed = config.get("resumed", [])
+    return isinstance(resumed, list) and all(map(_is_session, [config, *resumed]))
+
+
+def _is_session(session: Any) -> bool:
+    """Whether it can be what `provenance` says of a process that trained."""
+    if not isinstance(session, dict):
+        return False
+    return isinstance(session.get("versions", {}), dict) and isinstance(session.get("command", []), list)
+
+
+def lines(log: pathlib.Path) -> Iterator[tuple[int, Row | None]]:
+    """Every line of a log with its number, None where it is damaged; nothing where there is no log.
+
+    A last line without its end is left out: a training is writing it, or was killed as it did.
+
+    Raises:
+        UserError: the log cannot be read.
+    """
+    if not log.exists():
+        return
+    try:
+        with log.open(encoding="utf-8", errors="replace", newline="\n") as file:
+            for number, line in enumerate(file, 1):
+                if line.endswith("\n"):
+                    yield number, _row(line)
+    except OSError as error:
+        raise UserError(f"{log} cannot be read ({error.strerror}): restore it from a copy.") from None
+
+
+def last_rows(log: pathlib.Path, size: int = 32_768) -> list[Row]:
+    """The entries in the last `size` bytes of a log; damaged ones are left out.
+
+    Raises:
+        UserError: the log cannot be read.
+    """
+    if not log.exists():
+        return []
+    try:
+        with log.open("rb") as file:
+            start = max(0, log.stat().st_size - size)
+            file.seek(start)
+            parts = file.read().decode(errors="replace").split("\n")
+    except OSError as error:
+        raise UserError(f"{log} cannot be read ({error.strerror}): restore it from a copy.") from None
+    rows = map(_row, parts[1:-1] if start else parts[:-1])
+    return [row for row in rows if row is not None]
+
+
+def damage(log: pathlib.Path) -> str | None:
+    """A sentence on the damaged lines of a log, None if it has none.
+
+    Raises:
+        UserError: the log cannot be read.
+    """
+    damaged = [number for number, row in lines(log) if row is None]
+    if not damaged:
+        return None
+    if len(damaged) == 1:
+        return f"Line {damaged[0]} of {log} is damaged and left out."
+    return f"{len(damaged)} lines of {log} are damaged and left out, the first is line {damaged[0]}."
+
+
+def _row(line: str) -> Row | None:
+    """A line of a log; None if it is not what a training writes."""
+    row = _json(line)
+    if not isinstance(row, dict) or not isinstance(row.get("kind"), str) or not _is_step(row.get("step")):
+        return None
+    if row["kind"] == "evaluation" and not (isinstance(row.get("sampled"), list) and isinstance(row.get("mode"), list)):
+        return None
+    return row if all(map(_is_value, row.values())) else None
+
+
+def _is_step(value: Any) -> bool:
+    return isinstance(value, int) and 0 <= value <= LARGEST
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, float) or (isinstance(value, int) and abs(value) <= LARGEST)
+
+
+def _are_numbers(values: Any) -> bool:
+    return isinstance(values, list) and len(values) > 0 and all(map(_is_number, values))
+
+
+def _is_value(value: Any) -> bool:
+    """Whether it is a text, a number, or numbers."""
+    return isinstance(value, str) or _is_number(value) or _are_numbers(value)
+
+
+def is_summary(results: Any, seeds: int) -> bool:
+    """Whether a results.json is the summary of an evaluation (`evaluation.summary`) of so many seeds, or empty."""
+    if results == {}:
+        return True
+    if not isinstance(results, dict) or not _is_step(results.get("step")):
+        return False
+    sampled: Any = results.get("sampled")
+    mode: Any = results.get("mode")
+    if not (_is_mode(sampled, seeds) and _is_mode(mode, seeds)):
+        return False
+    return (sampled["success"] is None) == (mode["success"] is None)
+
+
+def _is_mode(mode: Any, seeds: int) -> bool:
+    """Whether it is what a summary says of one mode."""
+    if not isinstance(mode, dict) or not {"mean", "sem", "seeds", "success", "seeds_success"} <= mode.keys():
+        return False
+    returns, rates = mode["seeds"], mode["seeds_success"]
+    if not isinstance(returns, list) or len(returns) != seeds or not _is_number(mode["mean"]):
+        return False
+    if (rates is None) != (mode["success"] is None):
+        return False
+    if rates is not None and not (_are_numbers(rates) and len(rates) == seeds and _is_number(mode["success"])):
+        return False
+    return all(value is None or _is_number(value) for value in (mode["sem"], *returns))
