@@ -30,9 +30,9 @@ State = tuple[np.ndarray, ...]
 class Policy:
     """What a training has learned, as a function from perceptions to actions."""
 
-    def __init__(self, agent: Agent, spec: Spec, state: Any, seed: int = 0):
-        """Of one trained state of an agent; `seed` is of the sampled actions."""
-        self.agent, self.spec = agent, spec
+    def __init__(self, agent: Agent, spec: Spec, state: Any, seed: int = 0, precision: str = "float32"):
+        """Of one trained state of an agent; `seed` is of the sampled actions, `precision` that of `Run.precision`."""
+        self.agent, self.spec, self.precision = agent, spec, precision
         self._state = jax.device_put(state)
         self._structure = jax.tree.structure(agent.reset(spec))
         self._act = jax.jit(lambda *inputs: self._step(self._state, *inputs))
@@ -55,7 +55,8 @@ class Policy:
         def act(memory, step, key):
             return self.agent.act(agent_state, memory, step, key, ~deterministic)
 
-        action, memory = jax.vmap(act)(memory, step, keys)
+        with jax.default_matmul_precision(self.precision):
+            action, memory = jax.vmap(act)(memory, step, keys)
         return action, (*jax.tree.leaves(memory), action)
 
     def initial_state(self, batch: int) -> State:
@@ -155,5 +156,5 @@ def load(
         UserError: there is no such run, nothing was saved in it, or it has no such seed.
     """
     run = run if isinstance(run, Run) else Run(run)
-    agent, found, state = restore_seed(run, seed, task)
-    return Policy(agent, found.spec, state, run.seeds[0] if seed is None else seed)
+    agent, found, state, precision = restore_seed(run, seed, task)
+    return Policy(agent, found.spec, state, run.seeds[0] if seed is None else seed, precision)

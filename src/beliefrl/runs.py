@@ -27,6 +27,7 @@ from beliefrl.trackers import Tracker
 from beliefrl.types import UserError
 
 Row = dict[str, Any]
+PRECISIONS = ("float32", "tensorfloat32")  # of matrix products, by their names in JAX
 
 
 class Run:
@@ -58,6 +59,11 @@ class Run:
         """The numbers of the run's seeds."""
         first, count = self.config["options"]["seed"], self.config["options"]["seeds"]
         return list(range(first, first + count))
+
+    @property
+    def precision(self) -> str:
+        """That of matrix products in training, for `jax.default_matmul_precision`; float32 where none was recorded."""
+        return self.config["options"].get("precision", "float32")
 
     def rows(self, seed: int, kind: str | None = None) -> Iterator[Row]:
         """The log of a seed in the order it was written; of one kind, if given.

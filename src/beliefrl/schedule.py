@@ -17,6 +17,7 @@ from beliefrl.evaluation import MOST_EPISODES
 from beliefrl.lockstep import PROCESSES
 from beliefrl.phases import Metrics, Program, Seed
 from beliefrl.rollout import Episode
+from beliefrl.runs import PRECISIONS
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
 from beliefrl.types import UserError, check_choice, check_range
@@ -47,6 +48,9 @@ class Options:
     """Minutes between two checkpoints, if they pass sooner (0: none by time)."""
     keep_checkpoints: int = 2
     """How many of the last checkpoints are kept."""
+    precision: Literal["float32", "tensorfloat32"] = "float32"
+    """How matrix products are computed: float32, or with factors rounded to 10 bits of mantissa, which is faster on
+    NVIDIA GPUs since Ampere. A CPU computes in float32 either way."""
     track: tuple[Literal["tensorboard", "wandb"], ...] = ("tensorboard",)
     """Where numbers go besides the run's own logs: tensorboard, wandb (extra `wandb`; offline unless WANDB_MODE says
     otherwise), both, or nowhere."""
@@ -60,6 +64,7 @@ class Options:
         check_range(self, ("seeds",), 1, 10_000)
         check_range(self, ("seed",), 0, 2_000_000_000)
         check_choice(self, "processes", PROCESSES)
+        check_choice(self, "precision", PRECISIONS)
         for name in self.track:
             if name not in trackers.TRACKERS:
                 raise UserError(f"track={name} is impossible: it must be {' or '.join(trackers.TRACKERS)}.")

@@ -48,7 +48,7 @@ def train(
         out: the run's folder, which must not exist; None is runs/AGENT-TASK-1, or the next free number.
         report: called with every Event as it happens, for progress.
         options: the fields of `Options`: steps, seeds, seed, eval_every, eval_episodes, replay_capacity, processes,
-            checkpoint_steps, checkpoint_minutes, keep_checkpoints, track.
+            checkpoint_steps, checkpoint_minutes, keep_checkpoints, precision, track.
 
     Returns:
         The finished run: its results, its log, its files (`runs`).
@@ -142,7 +142,7 @@ class _Training:
     def run(self, restore: Callable[[Seed], Snapshot] | None = None) -> Run:
         """To the end, or until it is stopped."""
         try:
-            with self.requests:
+            with self.requests, jax.default_matmul_precision(self.options.precision):
                 for event in stages(self.agent, self.task, self.options, restore):
                     self._listen(event)
             self.checkpoints.close()
