@@ -16,6 +16,7 @@ import jaxtyping
 import pytest
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_default_matmul_precision", "highest")  # a GPU would round the factors of products otherwise
 jaxtyping.install_import_hook("beliefrl", "beartype.beartype")  # before the first import of beliefrl
 
 

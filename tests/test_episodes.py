@@ -17,7 +17,7 @@ TASK = tasks.make("pendulum-p", max_steps=6)
 
 
 def player(task=TASK, name="sac-lstm", rendered=False):
-    return Player(tiny(name), task, begun(name, task.spec, jax.random.key(0)), rendered)
+    return Player(tiny(name), task, begun(name, task.spec, jax.random.key(0)), rendered=rendered)
 
 
 @pytest.mark.parametrize(("ends", "last"), [(1000, 7), (4, 4)])

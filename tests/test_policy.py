@@ -130,7 +130,7 @@ def test_a_reward_is_ignored_where_an_episode_begins():
 
 def test_what_a_policy_is_shows():
     agent, state = trained("sac-mlp")
-    assert repr(Policy(agent, TASK.spec, state, 3, "pendulum-p")) == (
+    assert repr(Policy(agent, TASK.spec, state, 3, task="pendulum-p")) == (
         "<Policy sac-mlp on pendulum-p: 2 observations, 1 action, seed 3>"
     )
 

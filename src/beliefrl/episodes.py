@@ -43,8 +43,15 @@ class Frame(NamedTuple):
 class Player:
     """Plays episodes with one trained state of an agent in one environment; a context that closes it."""
 
-    def __init__(self, agent: Agent, task: Task | GymnasiumTask, state: Any, rendered: bool = False):
-        """`rendered`: whether frames will be asked for.
+    def __init__(
+        self,
+        agent: Agent,
+        task: Task | GymnasiumTask,
+        state: Any,
+        precision: str = "float32",
+        rendered: bool = False,
+    ):
+        """`precision`: of matrix products (`Run.precision`). `rendered`: whether frames will be asked for.
 
         Raises:
             UserError: the environment cannot be made, or not so that it can be rendered.
@@ -54,7 +61,8 @@ class Player:
         self._state = jax.device_put(state)
 
         def act(state, memory, step, key, time, explore):
-            return agent.act(state, memory, step, jax.random.fold_in(key, time), explore)
+            with jax.default_matmul_precision(precision):
+                return agent.act(state, memory, step, jax.random.fold_in(key, time), explore)
 
         self._act = jax.jit(act)
 

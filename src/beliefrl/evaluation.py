@@ -43,8 +43,8 @@ def summary(result: Episode, has_success: bool) -> dict[str, Any]:
     return table
 
 
-def restore(run: Run, task: Task | GymnasiumTask | None = None) -> tuple[Agent, Any, Any]:
-    """The agent, the task and the trained states (leading axis: seed) of a run.
+def restore(run: Run, task: Task | GymnasiumTask | None = None) -> tuple[Agent, Any, Any, str]:
+    """The agent, the task, the trained states (leading axis: seed) and the precision (`Run.precision`) of a run.
 
     `task` is needed only where the run was trained on a task of your own.
 
@@ -56,13 +56,13 @@ def restore(run: Run, task: Task | GymnasiumTask | None = None) -> tuple[Agent, 
     spec = found.spec
     keys = jax.random.split(jax.random.key(0), len(run.seeds))
     like = jax.eval_shape(jax.vmap(lambda key: agent.init(key, spec)), keys)
-    return agent, found, run.load(like)
+    return agent, found, run.load(like), run.precision
 
 
 def restore_seed(
     run: Run | str | os.PathLike[str], seed: int | None = None, task: Task | GymnasiumTask | None = None
-) -> tuple[Agent, Any, Any]:
-    """The agent, the task and the trained state of one seed of a run, its first if `seed` is None; see `restore`.
+) -> tuple[Agent, Any, Any, str]:
+    """The same of one seed of a run, its first if `seed` is None; see `restore`.
 
     Raises:
         UserError: there is no such run, nothing was saved in it, or it has no such seed.
@@ -71,8 +71,8 @@ def restore_seed(
     seed = run.seeds[0] if seed is None else seed
     if seed not in run.seeds:
         raise UserError(f"{run.folder} has no seed {seed}: it has {', '.join(map(str, run.seeds))}.")
-    agent, found, states = restore(run, task)
-    return agent, found, jax.tree.map(lambda leaf: leaf[run.seeds.index(seed)], states)
+    agent, found, states, precision = restore(run, task)
+    return agent, found, jax.tree.map(lambda leaf: leaf[run.seeds.index(seed)], states), precision
 
 
 def agent_of(run: Run) -> Agent:
@@ -132,12 +132,14 @@ def evaluate(
     if not 0 <= seed <= LARGEST:
         raise UserError(f"seed={seed} is impossible: it must be from 0 to {LARGEST}.")
     run = run if isinstance(run, Run) else Run(run)
-    agent, found, states = restore(run, task)
+    agent, found, states, precision = restore(run, task)
     keys = jax.random.split(jax.random.key(seed), len(run.seeds))
-    if isinstance(found, GymnasiumTask):
-        result = _on_host(agent, found, states, keys, episodes, run.seeds)
-    else:
-        result = jax.jit(jax.vmap(lambda state, key: evaluate_seed(agent, found, state, key, episodes)))(states, keys)
+    with jax.default_matmul_precision(precision):
+        if isinstance(found, GymnasiumTask):
+            result = _on_host(agent, found, states, keys, episodes, run.seeds)
+        else:
+            compiled = jax.jit(jax.vmap(lambda state, key: evaluate_seed(agent, found, state, key, episodes)))
+            result = compiled(states, keys)
     return {"episodes": episodes} | summary(result, found.spec.has_success)
 
 

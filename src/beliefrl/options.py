@@ -8,6 +8,7 @@ from beliefrl.types import UserError, check_choice, check_range
 
 MOST_EPISODES = 100_000  # side by side
 Processes = Literal["auto", "always", "never"]
+Precision = Literal["float32", "tensorfloat32"]  # by their names in JAX
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +36,9 @@ class Options:
     """Minutes between two checkpoints, if they pass sooner (0: none by time)."""
     keep_checkpoints: int = 2
     """How many of the last checkpoints are kept."""
+    precision: Precision = "float32"
+    """How matrix products are computed: float32, or with factors rounded to 10 bits of mantissa, which is faster on
+    NVIDIA GPUs since Ampere. A CPU computes in float32 either way."""
     track: tuple[Literal["tensorboard", "wandb"], ...] = ("tensorboard",)
     """Where numbers go besides the run's own logs: tensorboard, wandb (extra `wandb`; offline unless WANDB_MODE says
     otherwise), both, or nowhere."""
@@ -48,6 +52,7 @@ class Options:
         check_range(self, ("seeds",), 1, 10_000)
         check_range(self, ("seed",), 0, 2_000_000_000)
         check_choice(self, "processes", get_args(Processes))
+        check_choice(self, "precision", get_args(Precision))
         if not isinstance(self.track, tuple):
             raise UserError(f"track={self.track} is impossible: it must be a tuple of names.")
         for name in self.track:

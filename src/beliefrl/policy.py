@@ -32,10 +32,13 @@ State = tuple[np.ndarray, ...]
 class Policy:
     """What a training has learned, as a function from perceptions to actions."""
 
-    def __init__(self, agent: Agent, spec: Spec, state: Any, seed: int = 0, task: str = ""):
-        """One trained state of an agent. `seed` is the random seed of sampled actions, `task` a name to show."""
-        self.task = task
-        self.agent, self.spec, self.seed = agent, spec, seed
+    def __init__(self, agent: Agent, spec: Spec, state: Any, seed: int = 0, precision: str = "float32", task: str = ""):
+        """One trained state of an agent.
+
+        `seed` is the random seed of sampled actions, `precision` that of matrix products (`Run.precision`), `task` a
+        name to show.
+        """
+        self.agent, self.spec, self.seed, self.precision, self.task = agent, spec, seed, precision, task
         self._state = jax.device_put(state)
         self._empty = jax.device_get(agent.reset(spec))  # the memory in which an episode begins
         self._act = jax.jit(lambda *inputs: self._step(self._state, *inputs))
@@ -65,7 +68,8 @@ class Policy:
         def act(memory, step, key):
             return self.agent.act(agent_state, memory, step, key, ~deterministic)
 
-        action, memory = jax.vmap(act)(memory, step, keys)
+        with jax.default_matmul_precision(self.precision):
+            action, memory = jax.vmap(act)(memory, step, keys)
         return action, (*jax.tree.leaves(memory), action)
 
     def initial_state(self, batch: int) -> State:
@@ -172,8 +176,9 @@ def load(
         UserError: there is no such run, nothing was saved in it, or it has no such seed.
     """
     run = run if isinstance(run, Run) else Run(run)
-    agent, found, state = restore_seed(run, seed, task)
-    return Policy(agent, found.spec, state, run.seeds[0] if seed is None else seed, run.config["task"])
+    agent, found, state, precision = restore_seed(run, seed, task)
+    seed = run.seeds[0] if seed is None else seed
+    return Policy(agent, found.spec, state, seed, precision, run.config["task"])
 
 
 def _numbers(value: Any, name: str) -> np.ndarray:

@@ -96,9 +96,9 @@ def predictions(
     check_episode(episode_seed)
     _check_sizes(start, horizon, samples)
     run = run if isinstance(run, Run) else Run(run)
-    agent, found, state = restore_seed(run, seed, task)
+    agent, found, state, precision = restore_seed(run, seed, task)
     name = _model(run, agent, model)
-    with Player(agent, found, state) as player:
+    with Player(agent, found, state, precision) as player:
         steps = player.play(episode_seed, sampled, (START if start is None else start) + horizon - 1).steps
     moments = len(steps.reward)
     start = min(START, moments // 2) if start is None else start
@@ -110,10 +110,11 @@ def predictions(
 
     time, key = np.arange(len(steps.reward)), jax.random.key(episode_seed)
     compiled = jax.jit(partial(predict, agent), static_argnames=("model", "samples"))
-    loops = (compiled(state, name, steps, seen, samples, key) for seen in (time >= 0, time < start))
+    with jax.default_matmul_precision(precision):
+        loops = [compiled(state, name, steps, seen, samples, key) for seen in (time >= 0, time < start)]
     seed = run.seeds[0] if seed is None else seed
     title = f"{run.config['agent']} on {run.config['task']}, seed {seed}: {name} model"
-    return Predictions(title, tasks.entries(found), start, np.asarray(perception(steps)), *jax.device_get(tuple(loops)))
+    return Predictions(title, tasks.entries(found), start, np.asarray(perception(steps)), *jax.device_get(loops))
 
 
 def _check_sizes(start: int | None, horizon: int, samples: int) -> None:

@@ -71,6 +71,11 @@ class Run:
         first, count = self.config["options"]["seed"], self.config["options"]["seeds"]
         return list(range(first, first + count))
 
+    @property
+    def precision(self) -> str:
+        """That of matrix products in training, for `jax.default_matmul_precision`; float32 where none was recorded."""
+        return self.options.precision
+
     def rows(self, seed: int, kind: str | None = None) -> Iterator[Row]:
         """The log of a seed in the order it was written; of one kind, if given. Damaged lines are left out.
 

@@ -48,7 +48,7 @@ def train(
             or a training left it that ended before it saved an agent or a checkpoint; then it is used again.
         report: called with every Event as it happens, for progress. Notes that cannot wait come from another thread.
         options: the fields of `Options`: steps, seeds, seed, eval_every, eval_episodes, replay_capacity, processes,
-            checkpoint_steps, checkpoint_minutes, keep_checkpoints, track.
+            checkpoint_steps, checkpoint_minutes, keep_checkpoints, precision, track.
 
     Returns:
         The finished run: its results, its log, its files (`runs`).
@@ -148,7 +148,7 @@ class _Training:
     def run(self, restore: Callable[[Seed], Snapshot] | None = None) -> Run:
         """To the end, or until it is stopped."""
         try:
-            with self.recorder:
+            with self.recorder, jax.default_matmul_precision(self.options.precision):
                 self._train(restore)
         except BrokenPipeError:  # whoever was reading the reports has gone
             raise

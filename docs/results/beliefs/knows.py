@@ -43,7 +43,7 @@ def tell(name, numbers):
 def main():
     """Of each run the deviation of the state, and what three ways to perceive leave of it."""
     for path in sys.argv[1:]:
-        agent, task, trained = restore_seed(path)
+        agent, task, trained, _ = restore_seed(path)
         episodes, perceived = list(play(agent, task, trained)), perceiver(agent, task, trained)
         ways = {
             "what is seen": lambda steps: np.asarray(perception(steps), float),

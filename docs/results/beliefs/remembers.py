@@ -36,7 +36,7 @@ def teller(inputs, reached):
 def main():
     """Of each run how episodes fail, and the share of moments at which the map tells the number of targets."""
     for path in sys.argv[1:]:
-        agent, task, trained = restore_seed(path)
+        agent, task, trained, _ = restore_seed(path)
         with Player(agent, task, trained) as player:
             played = [player.play(episode, sampled=True) for episode in range(EPISODES)]
         beliefs = perceiver(agent, task, trained)

@@ -53,7 +53,7 @@ def draw_values(axis, runs):
 
 def draw_episodes(top, below, run):
     """Where the cart is, and how far the pole tilts, in episodes of one agent."""
-    agent, task, state = restore_seed(run, None, None)
+    agent, task, state, _ = restore_seed(run, None, None)
     ends = []
     with Player(agent, task, state, rendered=True) as player:
         for episode in EPISODES:
