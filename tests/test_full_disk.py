@@ -25,7 +25,8 @@ def limited(*given, **named):
 setattr(kind, name, limited)
 from beliefrl import UserError, agents, train
 from beliefrl.runs import Recorder
-agent = agents.make("sac-mlp", step_start_rl=20, pretrain_updates=5, batch_size=8, policy_layers=(8,), value_layers=(8,))
+sizes = {"batch_size": 8, "policy_layers": (8,), "value_layers": (8,)}
+agent = agents.make("sac-mlp", step_start_rl=20, pretrain_updates=5, **sizes)
 try:
     train(agent, "pendulum-v", "run", steps=40, checkpoint_steps=20, eval_every=20, eval_episodes=1)
 except UserError as error:

@@ -70,7 +70,7 @@ def test_what_is_shown_is_what_is_done(task):
 
 def test_the_first_step_is_taken_when_exploring_is_shown():
     seen = []
-    with pytest.raises(UserError):
+    with pytest.raises(UserError):  # noqa: PT012
         for event in stages(agents.make("sac-mlp"), GymnasiumTask(Broken), Options(steps=5)):
             seen.append(event.doing)
     assert seen[-2:] == ["exploring", "stopped by a fault"]
@@ -85,6 +85,6 @@ def test_no_control_character_of_an_environment_reaches_the_terminal():
     told = RuntimeError("\x1b[31mred\x1b[0m \x1b]0;title\x07bell\x07 \x9b2Jclear\u202e")
     environment = GymnasiumTask(raising(told), "robot").environment()
     environment.reset()
-    with pytest.raises(UserError, match=r"^robot \(step 3\): step raised RuntimeError: red bell clear\.$"):
+    with pytest.raises(UserError, match=r"^robot \(step 3\): step raised RuntimeError: red bell clear\.$"):  # noqa: PT012
         for _ in range(3):
             environment.step(np.zeros(1))

@@ -37,7 +37,7 @@ class TensorBoard:
 
     def __init__(self, folder: pathlib.Path, seed: int, config: dict[str, Any]):
         from tensorboardX.event_file_writer import EventsWriter  # 0.5 s to import
-        from tensorboardX.proto.event_pb2 import Event
+        from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue]
         from tensorboardX.summary import scalar
 
         path = folder / "tensorboard" / f"seed-{seed}"
