@@ -6,10 +6,11 @@ import subprocess
 import sys
 
 import jax
+import jax.numpy as jnp
 import pytest
 
 from beliefrl import agents, cli
-from beliefrl.bench import Noise, bench, parameters
+from beliefrl.bench import Noise, _flop, bench, parameters
 from beliefrl.types import Spec, UserError
 
 SMALL = (
@@ -18,9 +19,9 @@ SMALL = (
 )
 MEASURED = {
     "ms_per_step",
-    "acting_ms",
-    "controller_update_ms",
-    "model_update_ms",
+    "acting_alone_ms",
+    "controller_update_alone_ms",
+    "model_update_alone_ms",
     "pretraining_ms",
     "pretraining_ms_per_update",
     "first_training_step_s",
@@ -76,8 +77,8 @@ def test_bench_measures_an_agent_without_a_model():
     """Its begin_cycle only prepares the batch, so no time counts as a model's."""
     agent = agents.make("sac-mlp", step_start_rl=10, batch_size=4, policy_layers=(4,), value_layers=(4,))
     result = bench(agent, 2, 1)
-    assert result["model_update_ms"] == 0
-    assert result["controller_update_ms"] > 0
+    assert result["model_update_alone_ms"] == 0
+    assert result["controller_update_alone_ms"] > 0
 
 
 @pytest.mark.parametrize(("name", "millions"), [("sac-mlp", 0.4), ("sac-lstm", 1.33), ("slac", 1.6)])
@@ -90,6 +91,19 @@ def test_parameters_are_the_authors_without_what_they_do_not_use():
     unused, second_lstm_biases, log_alpha = 66_048, 2 * 1_024, 1  # their number leaves log α out
     expected = 2_852_134 - unused - second_lstm_biases + log_alpha
     assert parameters(shapes(agents.make("vrm"), Spec(obs_dim=6, action_dim=3, max_steps=1000))) == expected
+
+
+def test_products_are_counted_as_they_are_executed():
+    """Equal ones once, those of a loop as often as it runs, and none over a single entry."""
+    a, b, square = jnp.ones((4, 5)), jnp.ones((5, 6)), jnp.ones((6, 6))
+
+    def products(a, b, square):
+        twice = jnp.tanh(a) @ b + jax.lax.stop_gradient(jnp.tanh(a)) @ b
+        other = (a + 1) @ b
+        looped = jax.lax.scan(lambda x, _: (x @ square, None), twice + other, length=7)[0]
+        return looped + a[:, :1] @ b[:1]
+
+    assert _flop(products, a, b, square) == 2 * (4 * 5 * 6) * 2 + 7 * 2 * (4 * 6 * 6)
 
 
 @pytest.mark.parametrize("sizes", [(0, 1), (1, -1), (1, 10**20)])

@@ -10,7 +10,6 @@ from beliefrl import evaluate, load, phases, play, resume, tasks, train
 from beliefrl.agents.sac import SAC
 from beliefrl.agents.vrm import VRMAgent
 from beliefrl.prediction import predictions
-from beliefrl.types import UserError
 from worlds import saved, tiny
 
 AGENT = tiny("sac-mlp", step_start_rl=10, pretrain_updates=2, batch_size=4)
@@ -83,8 +82,3 @@ def test_what_is_made_of_a_run_has_its_precision(tmp_path, monkeypatch, precisio
         seen.clear()
         use()
         assert set(seen) == {precision or "float32"}
-
-
-def test_an_unknown_one_is_refused(tmp_path):
-    with pytest.raises(UserError, match="precision='tf32' is impossible: it must be float32 or tensorfloat32"):
-        train(AGENT, "pendulum-v", tmp_path / "run", precision="tf32", **OPTIONS)

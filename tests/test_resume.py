@@ -1,4 +1,4 @@
-"""A training that is stopped, killed or extended goes on as if nothing had happened; what cannot go on says why."""
+"""A training that is stopped, killed or extended goes on, on a CPU to the last bit; what cannot go on says why."""
 
 import json
 import os

@@ -37,8 +37,8 @@ class Options:
     keep_checkpoints: int = 2
     """How many of the last checkpoints are kept."""
     precision: Precision = "float32"
-    """How matrix products are computed: float32, or with factors rounded to 10 bits of mantissa, which is faster on
-    NVIDIA GPUs since Ampere. A CPU computes in float32 either way."""
+    """Precision of matrix products: float32, or tensorfloat32, which lets an NVIDIA GPU (Ampere or later) round their
+    factors to 10 bits of mantissa to be faster. A CPU computes in float32 either way."""
     track: tuple[Literal["tensorboard", "wandb"], ...] = ("tensorboard",)
     """Where numbers go besides the run's own logs: tensorboard, wandb (extra `wandb`; offline unless WANDB_MODE says
     otherwise), both, or nowhere."""

@@ -84,11 +84,11 @@ def resume(
     task: Task | GymnasiumTask | None = None,
     report: Report | None = None,
 ) -> Run:
-    """Go on with a training from its last checkpoint, as if it had never stopped.
+    """Go on with a training from its last checkpoint.
 
-    On the same machine the metrics and the networks are those of a training that was not interrupted, to the last bit;
-    on a Gymnasium environment the episode that was going on is not, since its state cannot be saved: a new one begins.
-    A training that was stopped before its first checkpoint begins again from step 0.
+    On one machine and kind of device, metrics and networks are bit-identical to those of an uninterrupted training
+    (measured on CPU, not on a GPU). A Gymnasium environment cannot be saved: a new episode begins there. A training
+    that was stopped before its first checkpoint begins again from step 0.
 
     Args:
         run: a run, or its folder.

@@ -14,7 +14,7 @@ from beliefrl.arguments import agent_name, agent_options, named_values, parse
 
 @dataclasses.dataclass(frozen=True)
 class ResumeOptions:
-    """Go on with a training from its last checkpoint, as if it had never stopped; from step 0 where it has none yet."""
+    """Go on with a training from its last checkpoint; from step 0 where it has none yet."""
 
     run: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
