@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from beliefrl.analysis import results
 from beliefrl.runs import Row, Run
 from beliefrl.types import UserError
 
@@ -59,13 +60,16 @@ class Group:
 
 
 def find(paths: Sequence[str | os.PathLike[str]]) -> list[Run]:
-    """The runs in these folders, which are runs themselves or hold any number of them, however deep.
+    """The runs in these folders, which are runs themselves or hold any number of them, and in these files of results.
 
     Raises:
-        UserError: a folder does not exist, holds no run, or a run in it cannot be read.
+        UserError: a folder or file does not exist, holds no run, or a run in it cannot be read.
     """
     found: dict[pathlib.Path, Run] = {}
     for path in map(pathlib.Path, paths):
+        if path.name.endswith(results.ENDING):
+            found |= {run.folder: run for run in results.read(path)}
+            continue
         if not os.path.isdir(path):  # noqa: PTH112 - pathlib's raises where a name is too long
             raise UserError(f"There is no folder {path}: give the --out of a training or of a sweep.")
         inside = sorted(config.parent for config in path.rglob("config.json") if (config.parent / "metrics").is_dir())
