@@ -19,6 +19,7 @@ from string import Template
 from typing import Any
 
 from beliefrl.analysis.groups import find
+from beliefrl.analysis.results import KeptRun
 from beliefrl.arrays import write_whole
 from beliefrl.report.data import ReadOnce, told
 from beliefrl.types import UserError
@@ -30,7 +31,7 @@ def write_report(
     """Write the report of all runs in these folders; returns the page's path. A page that is there is replaced.
 
     Args:
-        paths: folders that are runs or hold runs, however deep.
+        paths: folders that are runs or hold runs, however deep, and files of results, NAME.json.gz.
         out: the page, NAME.html. Links to videos and pictures are relative to where it lies.
         unfinished: runs that are not finished count as well.
 
@@ -42,7 +43,8 @@ def write_report(
         raise UserError(f"The report is a page, which {out} is not called like: call it {out.with_suffix('.html')}.")
     if not os.path.isdir(out.parent):  # noqa: PTH112 - pathlib's raises where a name is too long
         raise UserError(f"There is no folder {out.parent} to write {out.name} into: make it, or choose another --out.")
-    content = page(told([ReadOnce(run.folder) for run in find(paths)], out.parent, unfinished))
+    runs = [run if isinstance(run, KeptRun) else ReadOnce(run.folder) for run in find(paths)]
+    content = page(told(runs, out.parent, unfinished))
     try:
         write_whole(out, content.encode())
     except OSError as error:
