@@ -51,6 +51,7 @@ def test_a_page_names_commands_and_options_that_exist(page):
             assert named[0] in (*agents.names(), *(["all"] if command == "bench" else []))
         if command == "train":
             assert not words[1:2] or words[1].startswith("-") or words[1].isupper() or tasks.knows(words[1])
+        assert all((ROOT / word).exists() for word in words if word.startswith("results/"))
         if options:
             known = set(re.findall(r"--[a-z][\w-]*", help_of(command, *named)))
             assert options <= known, f"beliefrl {command} {' '.join(named)} has no {options - known}"

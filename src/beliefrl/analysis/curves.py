@@ -1,10 +1,13 @@
 """The learning curve of a run: mean and standard error over seeds (Figures 4 and 6)."""
 
 import pathlib
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
-from beliefrl.runs import Run
+from beliefrl.figures import figure
+from beliefrl.runs import Row, Run
 from beliefrl.types import UserError
 
 COLOURS = {"sampled": "#1f6f8b", "mode": "#c8553d"}
@@ -22,6 +25,14 @@ def evaluations(run: Run, name: str) -> tuple[np.ndarray, np.ndarray]:
     return np.array(steps), np.array(table).reshape(len(seeds), -1)
 
 
+def means_between(updates: Sequence[Row], name: str, steps: Sequence[int]) -> np.ndarray:
+    """The mean of an entry of the updates up to each of `steps`, since the one before (step,); NaN: there is none."""
+    there = [row for row in updates if name in row]
+    at, values = np.array([row["step"] for row in there]), np.array([row[name] for row in there], float)
+    within = [values[(at > low) & (at <= high)] for low, high in zip([0, *steps], steps, strict=False)]
+    return np.array([part.mean() if part.size else np.nan for part in within])
+
+
 def standard_error(seeds: np.ndarray) -> np.ndarray:
     """S.E.M. over the first axis, of those that are not NaN; zeros where there is only one."""
     count = np.sum(~np.isnan(seeds), axis=0)
@@ -37,19 +48,25 @@ def draw_curve(run: Run, path: pathlib.Path | str | None = None) -> pathlib.Path
     Raises:
         UserError: there is no evaluation yet.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # no display, no global state
-    from matplotlib.figure import Figure
-
     path = pathlib.Path(path or run.folder / "curve.png")
+    curve_figure(run).savefig(path, dpi=150)
+    return path
+
+
+def curve_figure(run: Run) -> Any:
+    """The figure that `draw_curve` writes.
+
+    Raises:
+        UserError: there is no evaluation yet.
+    """
     if not evaluations(run, "sampled")[0].size:
         raise UserError(f"{run.folder} has no evaluation of every seed yet: there is no curve to draw.")
     panels = [("return", "")]
     if any("sampled_success" in row for row in run.rows(run.seeds[0], "evaluation")):
         panels.append(("success rate", "_success"))
 
-    figure = Figure(figsize=(5.6 * len(panels), 3.6), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    made = figure(5.6 * len(panels), 3.6)
+    axes = made.subplots(1, len(panels), squeeze=False)[0]
     for axis, (label, suffix) in zip(axes, panels, strict=True):
         for mode, colour in COLOURS.items():
             steps, seeds = evaluations(run, mode + suffix)
@@ -66,5 +83,4 @@ def draw_curve(run: Run, path: pathlib.Path | str | None = None) -> pathlib.Path
     spread = f"mean and S.E.M. of {count} seeds" if count > 1 else "1 seed"
     axes[0].set_title(f"{run.config['agent']} on {run.config['task']}, {spread}", loc="left", fontsize=10)
     axes[0].legend(frameon=False, loc="best", fontsize=9)
-    figure.savefig(path, dpi=150)
-    return path
+    return made

@@ -5,13 +5,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from beliefrl.analysis.curves import means_between
 from beliefrl.analysis.groups import Curve, Group
 from beliefrl.analysis.palette import colours
 from beliefrl.analysis.panels import add_legend, draw_line, finish, panels, spread, with_curve
+from beliefrl.analysis.results import MODEL_LOSSES
 from beliefrl.figures import save
 from beliefrl.types import UserError
 
-NAMES = ("negative_elbo", "prediction_error")  # what an agent's model learns to make small, as its log calls it
 GREY = "#444444"
 
 
@@ -21,13 +22,10 @@ def model_loss(group: Group) -> Curve | None:
     table = []
     for run, seed in group.seeds:
         rows = list(run.rows(seed, "update"))
-        found = [name for name in NAMES if rows and name in rows[-1]]
+        found = [name for name in MODEL_LOSSES if rows and name in rows[-1]]
         if not found:
             return None
-        at = np.array([row["step"] for row in rows])
-        losses = np.array([row[found[0]] for row in rows])
-        within = [losses[(at > low) & (at <= high)] for low, high in zip([0, *steps[:-1]], steps, strict=True)]
-        table.append([part.mean() if part.size else np.nan for part in within])
+        table.append(means_between(rows, found[0], steps.tolist()))
     return Curve(steps, np.array(table)).since(~np.all(np.isnan(table), axis=0))
 
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from beliefrl.analysis import results
 from beliefrl.runs import Row, Run
 from beliefrl.types import UserError
 
@@ -66,17 +67,20 @@ class Found(NamedTuple):
 
 
 def find(paths: Sequence[str | os.PathLike[str]], opened: Callable[[pathlib.Path], Run] = Run) -> Found:
-    """The runs in these folders, which are runs themselves or hold any number of them, however deep.
+    """The runs in these folders, which are runs or hold runs at any depth, and in these files of results.
 
     A run that cannot be read is left out. `opened` opens a run's folder.
 
     Raises:
-        UserError: a folder does not exist, holds no run, or none of the runs can be read.
+        UserError: a folder or file does not exist, holds no run, or none of the runs can be read.
     """
     found: dict[pathlib.Path, Run] = {}
     unreadable: dict[pathlib.Path, str] = {}
     logs: list[str] = []
     for path in map(pathlib.Path, paths):
+        if path.name.endswith(results.ENDING):
+            found |= {run.folder: run for run in results.read(path)}
+            continue
         if not os.path.isdir(path):  # noqa: PTH112 - pathlib's raises where a name is too long
             raise UserError(f"There is no folder {path}: give the --out of a training or of a sweep.")
         inside = sorted(config.parent for config in path.rglob("config.json") if (config.parent / "metrics").is_dir())

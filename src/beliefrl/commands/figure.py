@@ -1,27 +1,30 @@
 """`beliefrl figure`."""
 
 import dataclasses
+import fnmatch
 import pathlib
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from beliefrl.arguments import UsageError, parse
 
-KINDS = ("curves", "ablation", "sensitivity", "elbo", "aggregate", "scalability", "table")
+KINDS = ("curves", "run", "ablation", "sensitivity", "elbo", "aggregate", "scalability", "table")
 TABLES = ("scalability", "table")
 HELP = """usage: beliefrl figure KIND RUNS ... [--out FILE]
 
   curves        learning curves: mean and S.E.M. over seeds, a line an agent, a panel a task (Section 5)
-  ablation      the same of VRM and its ablations (Appendix C)
+  run           one run: sampled and mode actions, with a thin line a seed; its curve.png
+  ablation      the curves of VRM and its ablations (Appendix C)
   sensitivity   VRM with the paper's and with drawn settings (Appendix F; runs of `sweep --preset sensitivity`)
   elbo          return beside the negative ELBO of the keep-learning model (Section 5.4)
   aggregate     interquartile means and performance profiles over tasks, with bootstrap intervals
   scalability   wall-clock time and parameters, as Markdown and LaTeX (Appendix G)
   table         returns at the end, when a task was solved, wall-clock time: as Markdown and LaTeX
 
-RUNS are runs, or folders that hold runs, such as a sweep's. `beliefrl figure KIND --help` shows the options.
+RUNS are runs, folders that hold runs, such as a sweep's, or files of results, NAME.json.gz.
+`beliefrl figure KIND --help` shows the options.
 """
 
 
@@ -32,7 +35,7 @@ class FigureOptions:
     runs: Annotated[
         tyro.conf.Positional[tuple[pathlib.Path, ...]], tyro.conf.arg(metavar="RUNS", help_behavior_hint="(required)")
     ]
-    """Runs, or folders that hold runs, such as a sweep's."""
+    """Runs, folders that hold runs, such as a sweep's, or files of results, NAME.json.gz."""
     out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """The file, without an ending or with .png or .pdf (scalability, table: .md or .tex). None: KIND in this folder."""
     actions: Literal["sampled", "mode"] = "sampled"
@@ -41,6 +44,10 @@ class FigureOptions:
     """Only these tasks."""
     agents: tuple[str, ...] = ()
     """Only these agents."""
+    names: tuple[str, ...] = ()
+    """Only runs whose folder has one of these names; * and ? stand for anything, as in 'vrm-*-seed0'."""
+    until: int | None = None
+    """Only evaluations up to so many environment steps. None: all."""
     unfinished: bool = False
     """Also runs that have not come to their end, as far as all seeds of an agent have come."""
 
@@ -55,47 +62,69 @@ def figure(argv: Sequence[str]) -> None:
         raise UsageError(f"{given}: write beliefrl figure KIND RUNS, where KIND is {', '.join(KINDS)}.")
     kind = argv[0]
     options = parse(FigureOptions, argv[1:], f"beliefrl figure {kind}")
-    groups, notes = _groups(options, kind)
+    runs, notes = _runs(options, kind)
     out = options.out or pathlib.Path(kind)
-
-    from beliefrl.analysis import aggregate, elbo, final, panels, scalability
-    from beliefrl.sweeps import presets
-
+    path = _draw(kind, runs, out, options.actions)
     if kind in TABLES:
-        path = (scalability.write_costs if kind == "scalability" else final.write_final)(groups, out)
         print(path.read_text(), end="")
-    elif kind == "elbo":
-        path = elbo.draw_elbo(groups, out, options.actions)
-    elif kind == "aggregate":
-        path = aggregate.draw_aggregate(groups, out, options.actions)
-    elif kind == "sensitivity":
-        path = panels.draw_curves(panels.pooled(groups, presets.drawn, presets.PAPERS), out, options.actions)
-    else:
-        path = panels.draw_curves(groups, out, options.actions)
     for note in notes:
         print(note)
     print(f"written to {path} and {path.with_suffix('.tex' if kind in TABLES else '.pdf').name}")
 
 
-def _groups(options: FigureOptions, kind: str) -> tuple[list, list[str]]:
-    """The chosen runs' lines, and a sentence for each file that is damaged and each run that is left out."""
+def _draw(kind: str, runs: Sequence[Any], out: pathlib.Path, actions: str) -> pathlib.Path:
+    """Write the figure; returns the path of its PNG, or of the table in Markdown."""
     from beliefrl import agents
-    from beliefrl.analysis import groups
+    from beliefrl.analysis import aggregate, elbo, final, panels, scalability
+    from beliefrl.analysis.curves import curve_figure
+    from beliefrl.analysis.groups import groups
+    from beliefrl.figures import save
+    from beliefrl.sweeps import presets
+    from beliefrl.types import UserError
+
+    if kind == "run":
+        if len(runs) > 1:
+            raise UserError(f"A run is one: choose one of these {len(runs)} by --names, --agents or --tasks.")
+        return save(curve_figure(runs[0]), out)
+    lines = groups(runs, agents.defaults())
+    if kind in TABLES:
+        return (scalability.write_costs if kind == "scalability" else final.write_final)(lines, out)
+    if kind == "elbo":
+        return elbo.draw_elbo(lines, out, actions)
+    if kind == "aggregate":
+        return aggregate.draw_aggregate(lines, out, actions)
+    if kind == "sensitivity":
+        lines = panels.pooled(lines, presets.drawn, presets.PAPERS)
+    return panels.draw_curves(lines, out, actions)
+
+
+def _runs(options: FigureOptions, kind: str) -> tuple[list[Any], list[str]]:
+    """The chosen runs, and a sentence for each file that is damaged and each run that is left out."""
+    from beliefrl.analysis import groups, results
     from beliefrl.types import UserError
 
     if not options.runs:
-        raise UsageError("RUNS is missing: give runs, or folders that hold runs, such as a sweep's.")
+        raise UsageError("RUNS is missing: give runs, folders that hold runs, or files of results.")
     found = groups.find(options.runs)
-    chosen = [run for run in found.runs if not options.tasks or run.config["task"] in options.tasks]
-    chosen = [run for run in chosen if not options.agents or run.config["agent"] in options.agents]
-    if kind == "ablation":
-        chosen = [run for run in chosen if run.config["agent"].startswith("vrm")]
+    chosen = [run for run in found.runs if _is_chosen(run, options, kind)]
     drawn = [run for run in chosen if options.unfinished or groups.is_finished(run)]
     if not drawn:
         raise UserError(f"None of the {len(found.runs)} runs can be drawn: none that was asked for is finished.")
-    unfinished = [
+    notes = [f"damaged: {why}" for why in found.damage]
+    notes += [
         f"left out: {run.folder} is not finished (--unfinished draws it as far as it has come)"
         for run in chosen
         if run not in drawn
     ]
-    return groups.groups(drawn, agents.defaults()), [f"damaged: {why}" for why in found.damage] + unfinished
+    return drawn if options.until is None else [results.cut(run, options.until) for run in drawn], notes
+
+
+def _is_chosen(run: Any, options: FigureOptions, kind: str) -> bool:
+    """Whether a run has one of the tasks, agents and names that were asked for, and suits the figure."""
+    agent, task, name = run.config["agent"], run.config["task"], run.folder.name
+    return (
+        (not options.tasks or task in options.tasks)
+        and (not options.agents or agent in options.agents)
+        and (not options.names or any(fnmatch.fnmatchcase(name, pattern) for pattern in options.names))
+        and (kind != "ablation" or agent.startswith("vrm"))
+    )

@@ -35,7 +35,7 @@ def write_report(
     A run that cannot be read is left out, and so are damaged lines of a log; the page says so.
 
     Args:
-        paths: folders that are runs or hold runs, however deep.
+        paths: folders that are runs or hold runs, however deep, and files of results, NAME.json.gz.
         out: the page, NAME.html. Links to videos and pictures are relative to where it lies.
         unfinished: runs that are not finished count as well.
         note: called with a sentence for each run that cannot be read, and for each log with damaged lines.

@@ -1,0 +1,129 @@
+"""Results that are kept: the runs of an experiment in one small file, NAME.json.gz, which figures read as runs.
+
+    {"format": 1, "defaults": {AGENT: {NAME: value}}, "runs": [{"name", "config", "rows": {SEED: [row]}}]}
+
+`config` is the run's config.json, with only those hyperparameters that differ from the file's defaults of the agent.
+The rows are the evaluations, the divergences, and the means of the updates' `SERIES` between evaluations. Numbers have
+six significant digits.
+"""
+
+import gzip
+import json
+import pathlib
+import re
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from beliefrl.analysis.curves import means_between
+from beliefrl.arrays import write_whole
+from beliefrl.runs import Row, Run
+from beliefrl.types import UserError
+
+ENDING = ".json.gz"
+FORMAT = 1
+DIGITS = 6  # significant
+KINDS = ("evaluation", "diverged")  # rows that are kept whole
+MODEL_LOSSES = ("negative_elbo", "prediction_error")  # what an agent's model learns to make small, as its log calls it
+SERIES = (*MODEL_LOSSES, "q")
+
+
+class KeptRun(Run):
+    """A run out of a file of results: its settings, evaluations and means of its updates, but no trained agent."""
+
+    def __init__(self, folder: pathlib.Path, config: dict[str, Any], rows: Mapping[int, Sequence[Row]]):
+        """`folder` names the run: the file, and the name of the folder that it was packed from."""
+        self.folder, self.config, self._rows = folder, config, rows
+
+    def rows(self, seed: int, kind: str | None = None) -> Iterator[Row]:
+        return (row for row in self._rows[seed] if kind in (None, row["kind"]))
+
+
+def cut(run: Run, until: int) -> KeptRun:
+    """The run as it was after so many environment steps."""
+    rows = {seed: [row for row in run.rows(seed) if row["step"] <= until] for seed in run.seeds}
+    return KeptRun(run.folder, run.config, rows)
+
+
+def read(path: pathlib.Path) -> list[KeptRun]:
+    """The runs in a file of results, with all their hyperparameters.
+
+    Raises:
+        UserError: there is no such file, or it is not what `write` writes.
+    """
+    try:
+        content = json.loads(gzip.decompress(path.read_bytes()))
+        if content["format"] != FORMAT:
+            raise UserError(f"{path} has format {content['format']}, which this version cannot read: update beliefrl.")
+        return [_unpacked(path, entry, content["defaults"]) for entry in content["runs"]]
+    except FileNotFoundError:
+        raise UserError(f"There is no file {path}: give a file of results, or folders of runs.") from None
+    except (OSError, EOFError, ValueError, zlib.error, KeyError, TypeError, AttributeError):
+        raise UserError(f"{path} cannot be read as a file of results: restore it from a copy.") from None
+
+
+def _unpacked(path: pathlib.Path, entry: dict[str, Any], defaults: Mapping[str, Row]) -> KeptRun:
+    config = entry["config"]
+    config["hyperparameters"] = defaults.get(config["agent"], {}) | config["hyperparameters"]
+    run = KeptRun(path / entry["name"], config, {int(seed): rows for seed, rows in entry["rows"].items()})
+    if not all("step" in row and "kind" in row for seed in run.seeds for row in run.rows(seed)):
+        raise ValueError("a row lacks its step or kind")
+    return run
+
+
+def write(path: pathlib.Path, runs: Sequence[Run], defaults: Mapping[str, Row]) -> None:
+    """Write runs, finished or not, as one file; the same runs give the same bytes.
+
+    Args:
+        path: the file, NAME.json.gz. One that is there is replaced: to add to it, give the runs that are in it too.
+        runs: runs from folders or from files of results. Of a training that is there twice the later one counts.
+        defaults: the hyperparameters of agents by name (`agents.defaults`).
+
+    Raises:
+        UserError: two trainings have folders of one name, or the file cannot be written.
+    """
+    entries: dict[str, dict[str, Any]] = {}
+    for run in runs:
+        name, began = run.folder.name, run.config.get("started")
+        if name in entries and entries[name]["config"].get("started") != began:
+            raise UserError(f"Two trainings are called {name}: rename the folder of one, or use another file.")
+        entries[name] = _packed(run, defaults.get(run.config["agent"], {}))
+    used = sorted({run.config["agent"] for run in runs} & defaults.keys())
+    content = {
+        "format": FORMAT,
+        "defaults": {agent: defaults[agent] for agent in used},
+        "runs": [entries[name] for name in sorted(entries)],
+    }
+    try:
+        write_whole(path, gzip.compress(json.dumps(content, separators=(",", ":")).encode(), mtime=0))
+    except OSError as error:
+        raise UserError(f"{path} cannot be written ({error.strerror}): choose another file.") from None
+
+
+def _packed(run: Run, usual: Row) -> dict[str, Any]:
+    missing = object()
+    settings = usual | run.config["hyperparameters"]
+    own = {name: value for name, value in settings.items() if usual.get(name, missing) != value}
+    text = json.dumps(run.config | {"hyperparameters": own})
+    config = json.loads(re.sub(r'"/[^"]*/(runs/[^"]*)"', r'"\1"', text))  # where it lay on this machine says nothing
+    return {"name": run.folder.name, "config": config, "rows": {seed: _kept_rows(run, seed) for seed in run.seeds}}
+
+
+def _kept_rows(run: Run, seed: int) -> list[Row]:
+    updates = list(run.rows(seed, "update"))
+    steps = [row["step"] for row in run.rows(seed, "evaluation")]
+    means = {name: means_between(updates, name, steps) for name in SERIES}
+    rows: list[Row] = []
+    for index, step in enumerate(steps):
+        known = {name: of[index] for name, of in means.items() if not np.isnan(of[index])}
+        rows += [{"step": step, "kind": "update", **known}] if known else []
+    rows += [row for row in run.rows(seed) if row["kind"] in KINDS]
+    return [{name: _rounded(value) for name, value in row.items()} for row in sorted(rows, key=lambda row: row["step"])]
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_rounded(each) for each in value]
+    return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
