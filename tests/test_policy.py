@@ -1,5 +1,6 @@
 """A trained policy: the agent's own actions, in numpy; and its export, which jax alone can load."""
 
+import inspect
 import subprocess
 import sys
 
@@ -11,6 +12,7 @@ import pytest
 import beliefrl
 from beliefrl import agents, rollout, tasks
 from beliefrl.policy import Policy
+from beliefrl.runs import Run
 from beliefrl.types import UserError
 
 SMALL = {
@@ -42,7 +44,7 @@ def test_it_acts_as_the_agent_does_through_episodes(name):
         steps = [actor.step for actor in actors]
         parts = ("obs", "reward", "is_first")
         obs, reward, first = (np.stack([getattr(step, part) for step in steps]) for part in parts)
-        # of no account where an episode begins
+        # the reward is ignored where an episode begins
         action, memory = policy.predict(obs, np.where(first, 7.0, reward), memory, first)
         actors = [move(actor)[0] for actor in actors]
         np.testing.assert_allclose(action, np.stack([actor.step.prev_action for actor in actors]), rtol=1e-5, atol=1e-6)
@@ -80,12 +82,63 @@ def test_samples_differ_and_come_back_with_their_seed():
         ({"obs": np.zeros(3)}, r"obs has the shape \(3,\): it must be \(2,\) or \(batch, 2\)"),
         ({"obs": np.zeros((2, 2)), "reward": np.zeros(3)}, r"reward has the shape \(3,\)"),
         ({"obs": np.zeros((2, 2)), "episode_start": [True]}, r"episode_start has the shape \(1,\)"),
-        ({"obs": np.zeros((2, 2)), "state": (np.zeros((1, 1)),)}, "state does not fit 2 episodes"),
+        ({"obs": np.zeros((2, 2)), "state": (np.zeros((1, 1)),)}, "state is not one of this policy for 2 episodes"),
+        ({"obs": [0.0, 0.0], "state": "abc"}, "state is not one of this policy for 1 episode: give the second result"),
+        ({"obs": [0.0, 0.0], "state": (np.full((1, 1), np.nan, np.float32),)}, "state holds a number that is not"),
+        ({"obs": "abc"}, "obs must be real numbers, not 'abc'"),
+        ({"obs": [None, 0.0]}, r"obs must be real numbers, not \[None, 0.0\]"),
+        ({"obs": [1j, 0.0]}, "obs must be real numbers"),
+        ({"obs": [[0.0, 0.0], [0.0]]}, "obs must be real numbers"),
+        ({"obs": [0.0, 0.0], "reward": "1"}, "reward must be real numbers, not '1'"),
+        ({"obs": [0.0, 0.0], "reward": (np.zeros((1, 1)), np.zeros((1, 2)))}, "reward must be real numbers"),
+        ({"obs": [0.0, 0.0], "episode_start": "no"}, "episode_start must be True or False, not 'no'"),
+        ({"obs": [0.0, 0.0], "deterministic": 2}, "deterministic must be True or False, not 2"),
     ],
 )
-def test_wrong_shapes_are_one_sentence(wrong, sentence):
+def test_wrong_shapes_and_types_are_one_sentence(wrong, sentence):
     with pytest.raises(UserError, match=sentence):
         Policy(*_with_spec("sac-mlp")).predict(**wrong)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        ({"obs": [0.1, np.nan]}, "entry 1 of obs is nan as float32"),
+        ({"obs": [1e39, 0.1]}, "entry 0 of obs is inf as float32"),
+        ({"obs": [0.1, 0.2], "reward": np.nan}, "reward is nan as float32"),
+        ({"obs": [[0.1, 0.2], [0.1, -np.inf]]}, "entry 1 of obs of episode 1 is -inf as float32"),
+        ({"obs": [[0.1, 0.2]] * 2, "reward": [0.0, np.nan]}, "reward of episode 1 is nan as float32"),
+    ],
+)
+def test_numbers_that_are_not_finite_are_named_and_the_state_is_as_good_as_before(wrong, sentence):
+    policy, same = Policy(*_with_spec("vrm")), Policy(*_with_spec("vrm"))
+    obs = np.full_like(wrong["obs"], 0.3)
+    states = [each.predict(obs)[1] for each in (policy, same)]
+    with pytest.raises(UserError, match=sentence):
+        policy.predict(state=states[0], **wrong)
+    after = [
+        each.predict(obs, -1.0, state, deterministic=False)[0]
+        for each, state in zip((policy, same), states, strict=True)
+    ]
+    np.testing.assert_array_equal(*after)
+
+
+def test_a_reward_is_ignored_where_an_episode_begins():
+    policy = Policy(*_with_spec("vrm"))
+    np.testing.assert_array_equal(policy.predict([0.1, 0.2], np.nan)[0], policy.predict([0.1, 0.2])[0])
+
+
+def test_what_a_policy_is_shows():
+    agent, state = trained("sac-mlp")
+    assert repr(Policy(agent, TASK.spec, state, 3, "pendulum-p")) == (
+        "<Policy sac-mlp on pendulum-p: 2 observations, 1 action, seed 3>"
+    )
+
+
+@pytest.mark.parametrize("wrong", [None, 123])
+def test_what_is_no_path_is_no_run(wrong):
+    with pytest.raises(UserError, match=f"{wrong} is not a run: give a run, or the path of its folder"):
+        inspect.unwrap(Run.__init__)(Run.__new__(Run), wrong)  # in tests types are checked before it is called
 
 
 def test_an_export_that_cannot_be_written_is_one_sentence(tmp_path):

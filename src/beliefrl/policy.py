@@ -7,6 +7,7 @@
 In the manner of Stable-Baselines3's recurrent policies; the reward is one input more, as beliefs are formed of it.
 """
 
+import functools
 import os
 import pathlib
 from typing import Any
@@ -16,6 +17,7 @@ import jax.export
 import jax.numpy as jnp
 import numpy as np
 
+from beliefrl import agents
 from beliefrl.agents import Agent
 from beliefrl.arrays import write_whole
 from beliefrl.evaluation import restore_seed
@@ -30,18 +32,26 @@ State = tuple[np.ndarray, ...]
 class Policy:
     """What a training has learned, as a function from perceptions to actions."""
 
-    def __init__(self, agent: Agent, spec: Spec, state: Any, seed: int = 0):
-        """Of one trained state of an agent; `seed` is of the sampled actions."""
-        self.agent, self.spec = agent, spec
+    def __init__(self, agent: Agent, spec: Spec, state: Any, seed: int = 0, task: str = ""):
+        """One trained state of an agent. `seed` is the random seed of sampled actions, `task` a name to show."""
+        self.task = task
+        self.agent, self.spec, self.seed = agent, spec, seed
         self._state = jax.device_put(state)
-        self._structure = jax.tree.structure(agent.reset(spec))
+        self._empty = jax.device_get(agent.reset(spec))  # the memory in which an episode begins
         self._act = jax.jit(lambda *inputs: self._step(self._state, *inputs))
-        self._key, self._calls = seed, 0
+        self._calls = 0
+
+    def __repr__(self) -> str:
+        """Agent, task, sizes, seed: `<Policy vrm on pendulum-v: 1 observation, 1 action, seed 0>`."""
+        sizes = f"{_count(self.spec.obs_dim, 'observation')}, {_count(self.spec.action_dim, 'action')}"
+        on = f" on {self.task}" if self.task else ""
+        return f"<Policy {agents.name_of(self.agent)}{on}: {sizes}, seed {self.seed}>"
 
     def _step(self, agent_state, obs, reward, state, episode_start, seed, deterministic):
         """Act for a batch; `state` is the leaves of the memory and the action before, leaves (batch, ...)."""
         *memory, prev_action = state
-        memory = self._structure.unflatten(memory)
+        memory = jax.tree.structure(self._empty).unflatten(memory)
+        memory = jax.tree.map(functools.partial(_where_first, episode_start), self._empty, memory)
         step = Step(
             obs=obs,
             reward=jnp.where(episode_start, 0.0, reward),
@@ -59,59 +69,66 @@ class Policy:
         return action, (*jax.tree.leaves(memory), action)
 
     def initial_state(self, batch: int) -> State:
-        """The state in which `batch` episodes begin."""
-        leaves = [*jax.tree.leaves(self.agent.reset(self.spec)), jnp.zeros(self.spec.action_dim)]
-        return tuple(np.zeros((batch, *leaf.shape), leaf.dtype) for leaf in leaves)
+        """The state in which `batch` episodes begin: the agent's empty memory, and no action before."""
+        leaves = [*jax.tree.leaves(self._empty), np.zeros(self.spec.action_dim, np.float32)]
+        return tuple(np.repeat(np.asarray(leaf)[None], batch, axis=0) for leaf in leaves)
 
     def predict(
         self,
         obs: Any,
         reward: Any = 0.0,
-        state: State | None = None,
+        state: Any = None,
         episode_start: Any = None,
-        deterministic: bool = True,
+        deterministic: Any = True,
     ) -> tuple[np.ndarray, State]:
         """Perceive one moment of one or many episodes, and act.
 
         Args:
             obs: o_t, (obs,) or (batch, obs).
-            reward: r_{t-1} that came with it, a number or (batch,); of no account where an episode begins.
+            reward: r_{t-1} that came with it, a number or (batch,); ignored where an episode begins.
             state: what the last call returned; None where all episodes begin.
             episode_start: whether an episode begins with this moment, a bool or (batch,); None: where `state` is None.
-            deterministic: the policy's mode, or a sample.
+            deterministic: a bool; True is the policy's mode, False a sample.
 
         Returns:
             The action in [-1, 1], (action,) or (batch, action), and the state for the next call.
 
         Raises:
-            UserError: an input of another shape.
+            UserError: an input of another shape or type, or one that is not finite as float32. Nothing is computed
+                then: `state` is as good as before.
         """
-        obs = np.asarray(obs, np.float32)
+        obs = _numbers(obs, "obs")
         single = obs.ndim == 1
         obs = obs[None] if single else obs
         if obs.ndim != 2 or obs.shape[1] != self.spec.obs_dim:
             size = self.spec.obs_dim
             raise UserError(f"obs has the shape {obs.shape[single:]}: it must be ({size},) or (batch, {size}).")
         batch = len(obs)
-        begins = state is None if episode_start is None else episode_start
-        fresh = self.initial_state(batch)
-        state = fresh if state is None else state
-        if [np.shape(leaf) for leaf in state] != [leaf.shape for leaf in fresh]:
-            raise UserError(f"state does not fit {batch} episodes of this policy: give what `predict` gave for them.")
-        reward = self._each(reward, batch, np.float32, "reward")
-        begins = self._each(begins, batch, bool, "episode_start")
+        begins = _flags(state is None if episode_start is None else episode_start, batch, "episode_start")
+        reward = _each(_numbers(reward, "reward"), batch, "reward")
+        reward = np.where(begins, np.float32(0), reward)
+        _check_finite(obs, "obs", single)
+        _check_finite(reward[:, None], "reward", single)
+        state = self.initial_state(batch) if state is None else self._fitting(state, batch)
+        (mode,) = _flags(deterministic, 1, "deterministic")
         self._calls += 1
-        seed = np.uint32((self._key * 1_000_003 + self._calls) % (LARGEST + 1))
-        action, after = jax.device_get(self._act(obs, reward, state, begins, seed, np.bool_(deterministic)))
+        seed = np.uint32((self.seed * 1_000_003 + self._calls) % (LARGEST + 1))
+        action, after = jax.device_get(self._act(obs, reward, state, begins, seed, mode))
         return (action[0] if single else action), after
 
-    @staticmethod
-    def _each(value: Any, batch: int, kind: Any, name: str) -> np.ndarray:
-        """A number for each episode of a batch."""
-        value = np.asarray(value, kind)
-        if value.shape not in ((), (batch,)):
-            raise UserError(f"{name} has the shape {value.shape}: it must be one number or ({batch},).")
-        return np.broadcast_to(value, (batch,))
+    def _fitting(self, state: Any, batch: int) -> State:
+        """The same state, once it is sure to be one of this policy for so many episodes."""
+        wanted = [(leaf.shape, leaf.dtype) for leaf in self.initial_state(batch)]
+        leaves = list(state) if isinstance(state, tuple | list) else []
+        if [(np.shape(leaf), getattr(leaf, "dtype", None)) for leaf in leaves] != wanted:
+            raise UserError(
+                f"state is not one of this policy for {_count(batch, 'episode')}: give the second result of `predict`, "
+                "or None where all episodes begin."
+            )
+        for leaf in leaves:
+            if np.issubdtype(leaf.dtype, np.floating) and not np.isfinite(leaf).all():
+                raise UserError("state holds a number that is not finite: give the second result of `predict`.")
+        return tuple(leaves)
 
     def export(self, path: str | os.PathLike[str]) -> None:
         """Write the policy as one file that jax loads without this library, for any batch, on CPUs and NVIDIA GPUs.
@@ -120,8 +137,8 @@ class Policy:
             action, state = policy.call(obs, reward, state, episode_start, seed, deterministic)
 
         takes obs (batch, obs), reward and episode_start (batch,) as `predict` does, a uint32 seed of the sampled
-        actions, and a bool. The first state is zeros of the shapes that `policy.in_avals` tells. Loading needs the
-        package flatbuffers beside jax.
+        actions, and a bool. The shapes of the first state are in `policy.in_avals`; zeros will do, since the state
+        counts only where episode_start is False. Loading needs the package flatbuffers beside jax.
 
         Raises:
             UserError: the file cannot be written.
@@ -156,4 +173,59 @@ def load(
     """
     run = run if isinstance(run, Run) else Run(run)
     agent, found, state = restore_seed(run, seed, task)
-    return Policy(agent, found.spec, state, run.seeds[0] if seed is None else seed)
+    return Policy(agent, found.spec, state, run.seeds[0] if seed is None else seed, run.config["task"])
+
+
+def _numbers(value: Any, name: str) -> np.ndarray:
+    """As float32; what is too large for it becomes infinite.
+
+    Raises:
+        UserError: not real numbers.
+    """
+    try:
+        array = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        array = np.empty(0, object)
+    if array.dtype.kind not in "biuf":
+        raise UserError(f"{name} must be real numbers, not {_short(value)}.")
+    with np.errstate(over="ignore"):
+        return array.astype(np.float32)
+
+
+def _flags(value: Any, batch: int, name: str) -> np.ndarray:
+    """True or False for each episode of a batch."""
+    array = np.asarray(value)
+    if array.dtype.kind not in "biu" or not np.isin(array, (0, 1)).all():
+        raise UserError(f"{name} must be True or False, not {_short(value)}.")
+    return _each(array.astype(bool), batch, name)
+
+
+def _each(array: np.ndarray, batch: int, name: str) -> np.ndarray:
+    """An entry for each episode of a batch."""
+    if array.shape not in ((), (batch,)):
+        raise UserError(f"{name} has the shape {array.shape}: it must be one number or ({batch},).")
+    return np.broadcast_to(array, (batch,))
+
+
+def _check_finite(rows: np.ndarray, name: str, single: bool) -> None:
+    """Raise a UserError that names the first entry of (batch, entry) that is not finite."""
+    for episode, entry in np.argwhere(~np.isfinite(rows))[:1]:
+        which = f"entry {entry} of {name}" if name == "obs" else name
+        where = "" if single else f" of episode {episode}"
+        raise UserError(
+            f"{which}{where} is {rows[episode, entry]} as float32: give finite numbers; the state is as it was."
+        )
+
+
+def _where_first(is_first: Any, empty: Any, leaf: Any) -> Any:
+    """`empty` for those of a batch whose episode begins, else `leaf`; leaves (batch, ...)."""
+    return jnp.where(is_first.reshape(-1, *[1] * (leaf.ndim - 1)), empty, leaf)
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
+def _short(value: Any) -> str:
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 80 else f"{text[:77]}..."

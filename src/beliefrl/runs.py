@@ -36,8 +36,10 @@ class Run:
         """Open a folder that a training made.
 
         Raises:
-            UserError: it does not exist, or no training made it.
+            UserError: it does not exist, no training made it, or it is no path.
         """
+        if not isinstance(folder, str | os.PathLike):
+            raise UserError(f"{folder!r} is not a run: give a run, or the path of its folder.")
         self.folder = pathlib.Path(folder)
         if not os.path.isdir(self.folder):  # noqa: PTH112 - pathlib's raises where a name is too long
             raise UserError(f"There is no run folder {self.folder}: give the --out of a training.")
