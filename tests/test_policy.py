@@ -86,7 +86,15 @@ def test_samples_differ_and_come_back_with_their_seed():
         ({"obs": [0.0, 0.0], "state": "abc"}, "state is not one of this policy for 1 episode: give the second result"),
         ({"obs": [0.0, 0.0], "state": (np.full((1, 1), np.nan, np.float32),)}, "state holds a number that is not"),
         ({"obs": "abc"}, "obs must be real numbers, not 'abc'"),
-        ({"obs": [None, 0.0]}, r"obs must be real numbers, not \[None, 0.0\]"),
+        ({"obs": [0.0, None]}, "entry 1 of obs is None: give finite numbers"),
+        ({"obs": [[0.0, 0.0], [None, 0.0]]}, "entry 0 of obs of episode 1 is None"),
+        ({"obs": [True, False]}, r"obs must be real numbers, not \[True, False\]"),
+        ({"obs": np.array([0.0, 0.0], object)}, "obs must be real numbers, not array"),
+        ({"obs": None}, "obs is None"),
+        ({"obs": np.zeros((0, 2))}, "obs has no episode in it"),
+        ({"obs": [0.0, 0.0], "reward": None}, "reward is None: give finite numbers"),
+        ({"obs": [0.0, 0.0], "reward": True}, "reward must be real numbers, not True"),
+        ({"obs": [0.0, 0.0], "state": 1.0}, "state is not one of this policy for 1 episode"),
         ({"obs": [1j, 0.0]}, "obs must be real numbers"),
         ({"obs": [[0.0, 0.0], [0.0]]}, "obs must be real numbers"),
         ({"obs": [0.0, 0.0], "reward": "1"}, "reward must be real numbers, not '1'"),
@@ -103,11 +111,11 @@ def test_wrong_shapes_and_types_are_one_sentence(wrong, sentence):
 @pytest.mark.parametrize(
     ("wrong", "sentence"),
     [
-        ({"obs": [0.1, np.nan]}, "entry 1 of obs is nan as float32"),
-        ({"obs": [1e39, 0.1]}, "entry 0 of obs is inf as float32"),
-        ({"obs": [0.1, 0.2], "reward": np.nan}, "reward is nan as float32"),
-        ({"obs": [[0.1, 0.2], [0.1, -np.inf]]}, "entry 1 of obs of episode 1 is -inf as float32"),
-        ({"obs": [[0.1, 0.2]] * 2, "reward": [0.0, np.nan]}, "reward of episode 1 is nan as float32"),
+        ({"obs": [0.1, np.nan]}, "entry 1 of obs is nan: give finite numbers"),
+        ({"obs": [1e39, 0.1]}, r"entry 0 of obs is 1e\+39: give finite numbers"),
+        ({"obs": [0.1, 0.2], "reward": np.nan}, "reward is nan: give"),
+        ({"obs": [[0.1, 0.2], [0.1, -np.inf]]}, "entry 1 of obs of episode 1 is -inf"),
+        ({"obs": [[0.1, 0.2]] * 2, "reward": [0.0, np.nan]}, "reward of episode 1 is nan"),
     ],
 )
 def test_numbers_that_are_not_finite_are_named_and_the_state_is_as_good_as_before(wrong, sentence):
@@ -123,6 +131,21 @@ def test_numbers_that_are_not_finite_are_named_and_the_state_is_as_good_as_befor
     np.testing.assert_array_equal(*after)
 
 
+def test_an_action_that_would_not_be_finite_is_an_error():
+    agent, state = trained("sac-mlp")
+    state = jax.tree.map(lambda leaf: leaf * 1e6 if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, state)
+    policy = Policy(agent, TASK.spec, state)
+    assert np.isfinite(policy.predict([[0.1, 0.2], [-0.1, 0.3]])[0]).all()
+    with pytest.raises(UserError, match="obs or reward of episode 1 is too large for this policy"):
+        policy.predict([[0.1, 0.2], [3e38, 3e38]])
+
+
+@pytest.mark.parametrize("batch", [0, -1, 1.5, "two"])
+def test_a_batch_is_a_whole_number(batch):
+    with pytest.raises(UserError, match="is impossible: it must be a whole number of at least 1"):
+        inspect.unwrap(Policy.initial_state)(Policy(*_with_spec("sac-mlp")), batch)
+
+
 def test_a_reward_is_ignored_where_an_episode_begins():
     policy = Policy(*_with_spec("vrm"))
     np.testing.assert_array_equal(policy.predict([0.1, 0.2], np.nan)[0], policy.predict([0.1, 0.2])[0])
@@ -131,7 +154,7 @@ def test_a_reward_is_ignored_where_an_episode_begins():
 def test_what_a_policy_is_shows():
     agent, state = trained("sac-mlp")
     assert repr(Policy(agent, TASK.spec, state, 3, task="pendulum-p")) == (
-        "<Policy sac-mlp on pendulum-p: 2 observations, 1 action, seed 3>"
+        "<Policy sac-mlp on pendulum-p: observation (2,), action (1,), seed 3>"
     )
 
 

@@ -117,6 +117,20 @@ def test_the_pages_policy_forbids_other_scripts_and_the_network(a_page):
 
 @browser_test
 def test_a_phone_scrolls_only_downwards(a_page):
-    with Page(a_page, width=390, height=844, mobile=True) as page:
-        assert page.run("document.documentElement.scrollWidth") == 390
-        assert page.run("document.querySelector('.panel > svg').getBoundingClientRect().width") <= 390
+    with Page(a_page, width=360, height=740, mobile=True) as page:
+        assert page.run("document.documentElement.scrollWidth") == 360
+        assert page.run("document.querySelector('.panel > svg').getBoundingClientRect().width") <= 360
+
+
+@browser_test
+@pytest.mark.parametrize("width", [360, 600])
+def test_a_phone_shows_every_cell_of_every_table_with_its_heading(a_page, width):
+    """A table's box could be scrolled sideways, but nothing on a phone would say so."""
+    with Page(a_page, width=width, height=740, mobile=True) as page:
+        rights = page.run("[...document.querySelectorAll('.box *')].map((part) => part.getBoundingClientRect().right)")
+        assert len(rights) > 50
+        assert max(rights) <= width
+        mean = "document.querySelectorAll('#final tbody tr')[0].cells[4]"
+        assert page.run(f"getComputedStyle({mean}, '::before').content") == '"return, sampled actions"'
+        page.run("document.querySelectorAll('#final thead button')[4].click()")
+        assert page.run("document.querySelector('#final [aria-sort]').innerText").startswith("return, sampled actions")

@@ -13,6 +13,6 @@ from beliefrl.analysis import groups, results
 if len(sys.argv) < 3:
     sys.exit(__doc__)
 file, *given = map(pathlib.Path, sys.argv[1:])
-runs = groups.find([file, *given] if file.exists() else given)
+runs = groups.find([file, *given] if file.exists() else given).runs
 results.write(file, runs, agents.defaults())
 print(f"{file}: {len(results.read(file))} runs, {file.stat().st_size / 1000:.0f} kB")

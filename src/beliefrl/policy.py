@@ -10,6 +10,7 @@ In the manner of Stable-Baselines3's recurrent policies; the reward is one input
 import functools
 import os
 import pathlib
+from numbers import Integral, Real
 from typing import Any
 
 import jax
@@ -45,8 +46,8 @@ class Policy:
         self._calls = 0
 
     def __repr__(self) -> str:
-        """Agent, task, sizes, seed: `<Policy vrm on pendulum-v: 1 observation, 1 action, seed 0>`."""
-        sizes = f"{_count(self.spec.obs_dim, 'observation')}, {_count(self.spec.action_dim, 'action')}"
+        """Agent, task, sizes, seed: `<Policy vrm on pendulum-v: observation (1,), action (1,), seed 0>`."""
+        sizes = f"observation ({self.spec.obs_dim},), action ({self.spec.action_dim},)"
         on = f" on {self.task}" if self.task else ""
         return f"<Policy {agents.name_of(self.agent)}{on}: {sizes}, seed {self.seed}>"
 
@@ -73,7 +74,13 @@ class Policy:
         return action, (*jax.tree.leaves(memory), action)
 
     def initial_state(self, batch: int) -> State:
-        """The state in which `batch` episodes begin: the agent's empty memory, and no action before."""
+        """The state in which `batch` episodes begin: the agent's empty memory, and no action before.
+
+        Raises:
+            UserError: `batch` is no whole number of at least 1.
+        """
+        if not isinstance(batch, Integral) or batch < 1:
+            raise UserError(f"batch={short(batch)} is impossible: it must be a whole number of at least 1.")
         leaves = [*jax.tree.leaves(self._empty), np.zeros(self.spec.action_dim, np.float32)]
         return tuple(np.repeat(np.asarray(leaf)[None], batch, axis=0) for leaf in leaves)
 
@@ -98,26 +105,33 @@ class Policy:
             The action in [-1, 1], (action,) or (batch, action), and the state for the next call.
 
         Raises:
-            UserError: an input of another shape or type, or one that is not finite as float32. Nothing is computed
-                then: `state` is as good as before.
+            UserError: an input of another shape or type, or one that is not finite as float32; or one that is so large
+                that the action is not finite. `state` is as good as before.
         """
-        obs = _numbers(obs, "obs")
+        obs = given = _numbers(obs, "obs")
         single = obs.ndim == 1
         obs = obs[None] if single else obs
         if obs.ndim != 2 or obs.shape[1] != self.spec.obs_dim:
             size = self.spec.obs_dim
             raise UserError(f"obs has the shape {obs.shape[single:]}: it must be ({size},) or (batch, {size}).")
         batch = len(obs)
+        if not batch:
+            raise UserError("obs has no episode in it: give one or more.")
         begins = _flags(state is None if episode_start is None else episode_start, batch, "episode_start")
         reward = _each(_numbers(reward, "reward"), batch, "reward")
-        reward = np.where(begins, np.float32(0), reward)
-        _check_finite(obs, "obs", single)
-        _check_finite(reward[:, None], "reward", single)
+        reward = np.where(begins, 0, reward)
+        _check_finite(given, "obs")
+        _check_finite(reward.reshape(() if single else batch), "reward")
         state = self.initial_state(batch) if state is None else self._fitting(state, batch)
         (mode,) = _flags(deterministic, 1, "deterministic")
         self._calls += 1
         seed = np.uint32((self.seed * 1_000_003 + self._calls) % (LARGEST + 1))
+        obs, reward = obs.astype(np.float32), reward.astype(np.float32)
         action, after = jax.device_get(self._act(obs, reward, state, begins, seed, mode))
+        finite = np.all([np.isfinite(leaf.reshape(batch, -1)).all(axis=1) for leaf in after], axis=0)
+        for episode in np.flatnonzero(~finite):
+            which = "" if single else f" of episode {episode}"
+            raise UserError(f"obs or reward{which} is too large for this policy: its action would not be finite.")
         return (action[0] if single else action), after
 
     def _fitting(self, state: Any, batch: int) -> State:
@@ -182,19 +196,21 @@ def load(
 
 
 def _numbers(value: Any, name: str) -> np.ndarray:
-    """As float32; what is too large for it becomes infinite.
+    """What was given for obs or reward as an array of real numbers.
 
     Raises:
-        UserError: not real numbers.
+        UserError: something in it is no number.
     """
     try:
         array = np.asarray(value)
-    except ValueError:  # rows of different lengths
+    except Exception:  # rows of different lengths, or whatever a stranger's class may raise
         array = np.empty(0, object)
-    if array.dtype.kind not in "biuf":
+    for index, entry in np.ndenumerate(array if array.dtype == object else ()):
+        if not isinstance(entry, Real):
+            raise UserError(f"{_place(name, index)} is {short(entry)}: give finite numbers.")
+    if array.dtype.kind not in "iuf":
         raise UserError(f"{name} must be real numbers, not {short(value)}.")
-    with np.errstate(over="ignore"):
-        return array.astype(np.float32)
+    return array
 
 
 def _flags(value: Any, batch: int, name: str) -> np.ndarray:
@@ -212,14 +228,19 @@ def _each(array: np.ndarray, batch: int, name: str) -> np.ndarray:
     return np.broadcast_to(array, (batch,))
 
 
-def _check_finite(rows: np.ndarray, name: str, single: bool) -> None:
-    """Raise a UserError that names the first entry of (batch, entry) that is not finite."""
-    for episode, entry in np.argwhere(~np.isfinite(rows))[:1]:
-        which = f"entry {entry} of {name}" if name == "obs" else name
-        where = "" if single else f" of episode {episode}"
-        raise UserError(
-            f"{which}{where} is {rows[episode, entry]} as float32: give finite numbers; the state is as it was."
-        )
+def _check_finite(array: np.ndarray, name: str) -> None:
+    """Raise a UserError that names the first entry that is not finite as float32."""
+    with np.errstate(over="ignore"):
+        wrong = ~np.isfinite(array.astype(np.float32))
+    for index in map(tuple, np.argwhere(wrong).tolist()):
+        raise UserError(f"{_place(name, index)} is {array[index]}: give finite numbers, within float32.")
+
+
+def _place(name: str, index: tuple[int, ...]) -> str:
+    """An entry of obs or reward in words: `index` is (entry,) or (episode, entry) of obs, () or (episode,) of reward."""
+    *episode, entry = index if name == "obs" and index else (*index, None)
+    which = name if entry is None else f"entry {entry} of {name}"
+    return f"{which} of episode {episode[0]}" if episode else which
 
 
 def _where_first(is_first: Any, empty: Any, leaf: Any) -> Any:

@@ -28,9 +28,10 @@ function chips(fieldset, name, values, mark) {
 
 function table(element, columns, entries) {
   const rows = entries.map((entry) => {
-    const cells = columns.map(([, value, cell, numeric], i) =>
-      html(i ? "td" : "th", { class: numeric && "number", scope: !i && "row" }, (cell ?? value)(entry) ?? "–"),
-    );
+    const cells = columns.map(([heading, value, cell, numeric], i) => {
+      const about = { class: numeric && "number", scope: !i && "row", "data-heading": heading };
+      return html(i ? "td" : "th", about, (cell ?? value)(entry) ?? "–");
+    });
     return { entry, element: html("tr", {}, cells) };
   });
   const body = html("tbody");
