@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from beliefrl import folders
+from beliefrl.folders import locked, make
 from beliefrl.types import UserError
 
 CONFIG = {
@@ -28,16 +28,16 @@ def left(folder, *names):
 
 
 def test_what_a_failed_training_left_is_replaced(tmp_path):
-    folders.make(left(tmp_path), CONFIG | {"agent": "slac"})
+    make(left(tmp_path), CONFIG | {"agent": "slac"})
     assert {path.name for path in tmp_path.iterdir()} == {"metrics", "config.json", "lock"}
     assert json.loads((tmp_path / "config.json").read_text())["agent"] == "slac"
     assert not any((tmp_path / "metrics").iterdir())
 
 
 def test_an_empty_folder_and_one_that_was_just_made_are_taken(tmp_path):
-    folders.make(tmp_path, CONFIG)
+    make(tmp_path, CONFIG)
     (tmp_path / "config.json").rename(tmp_path / ".config.json.tmp")
-    folders.make(tmp_path, CONFIG)
+    make(tmp_path, CONFIG)
     assert (tmp_path / "config.json").exists()
 
 
@@ -57,18 +57,18 @@ def test_what_was_saved_or_is_the_users_stays(tmp_path, name):
     left(tmp_path, name)
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(UserError, match="exists already: choose another --out, or `beliefrl resume"):
-        folders.make(tmp_path, CONFIG)
+        make(tmp_path, CONFIG)
     assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_the_config_of_another_program_stays(tmp_path):
     (tmp_path / "config.json").write_text('{"editor": "vi"}')
     with pytest.raises(UserError, match=r"exists already: choose another --out\.$"):
-        folders.make(tmp_path, CONFIG)
+        make(tmp_path, CONFIG)
     assert (tmp_path / "config.json").read_text() == '{"editor": "vi"}'
 
 
 def test_a_training_that_goes_on_is_left_alone(tmp_path):
-    with folders.locked(left(tmp_path), "is being trained"), pytest.raises(UserError, match="is being trained by"):
-        folders.make(tmp_path, CONFIG)
+    with locked(left(tmp_path), "is being trained"), pytest.raises(UserError, match="is being trained by"):
+        make(tmp_path, CONFIG)
     assert (tmp_path / "metrics" / "seed-0.jsonl").exists()

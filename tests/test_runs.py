@@ -13,7 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from beliefrl import folders, runs
+import beliefrl
+from beliefrl.arrays import write_whole
+from beliefrl.folders import free_folder
 from beliefrl.options import Options
 from beliefrl.provenance import provenance
 from beliefrl.runs import Recorder, Run
@@ -287,13 +289,13 @@ def test_loading_runs_no_code_from_the_file(recorder, tmp_path):
 
 
 def test_the_library_unpickles_nothing():
-    for path in pathlib.Path(runs.__file__).parent.rglob("*.py"):
+    for path in pathlib.Path(beliefrl.__file__).parent.rglob("*.py"):
         assert not re.search(r"\b(pickle|cloudpickle|dill|joblib|allow_pickle)\b", path.read_text()), path
 
 
 def test_an_interrupted_write_leaves_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "agent"
-    runs.write_whole(path, b"old")
+    write_whole(path, b"old")
 
     def interrupt(_):
         raise KeyboardInterrupt
@@ -301,9 +303,9 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", interrupt)
         with pytest.raises(KeyboardInterrupt):
-            runs.write_whole(path, b"new and longer")
+            write_whole(path, b"new and longer")
     assert path.read_bytes() == b"old"
-    runs.write_whole(path, b"new")
+    write_whole(path, b"new")
     assert path.read_bytes() == b"new"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -338,10 +340,10 @@ def test_damaged_results_are_refused(recorder, results):
 
 def test_free_folder_takes_the_first_free_number(tmp_path):
     parent = str(tmp_path)
-    assert folders.free_folder("vrm-pendulum", parent) == tmp_path / "vrm-pendulum-1"
+    assert free_folder("vrm-pendulum", parent) == tmp_path / "vrm-pendulum-1"
     (tmp_path / "vrm-pendulum-1").mkdir()
     (tmp_path / "vrm-pendulum-3").mkdir()
-    assert folders.free_folder("vrm-pendulum", parent) == tmp_path / "vrm-pendulum-2"
+    assert free_folder("vrm-pendulum", parent) == tmp_path / "vrm-pendulum-2"
 
 
 def test_provenance_says_what_a_run_was_made_with():

@@ -15,11 +15,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from beliefrl import agents, folders, log, tasks, trackers
+from beliefrl import agents, log, tasks, trackers
 from beliefrl.agents import Agent
 from beliefrl.analysis.curves import draw_curve
 from beliefrl.checkpoint import Checkpoints, listed, was_ever_written
 from beliefrl.evaluation import agent_of, task_of, tuples
+from beliefrl.folders import free_folder
 from beliefrl.phases import Seed
 from beliefrl.provenance import provenance
 from beliefrl.runs import Recorder, Run
@@ -74,7 +75,7 @@ def train(
         "options": dataclasses.asdict(chosen),
         **provenance(),
     }
-    recorder = Recorder(out or folders.free_folder(f"{config['agent']}-{config['task']}"), config)
+    recorder = Recorder(out or free_folder(f"{config['agent']}-{config['task']}"), config)
     return _Training(recorder, agent, made, chosen, report).run()
 
 

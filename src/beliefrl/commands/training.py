@@ -26,9 +26,10 @@ def train(argv: Sequence[str]) -> None:
     """`beliefrl train AGENT TASK ...`."""
     from rich.console import Console
 
-    from beliefrl import agents, runs, tasks
+    from beliefrl import agents, tasks
     from beliefrl.display import TrainingDisplay
     from beliefrl.options import Options
+    from beliefrl.runs import Run
     from beliefrl.train import train as run_training
 
     name, rest = agent_name(argv, "train", "TASK")
@@ -80,7 +81,7 @@ def train(argv: Sequence[str]) -> None:
     task = tasks.make(options.task, options.observe or None, **named_values(options.constants, "--constants"))
     console = Console()
     if options.resume and options.out is not None and os.path.exists(options.out / "config.json"):  # noqa: PTH110 - pathlib's raises where a name is too long
-        _same_training(runs.Run(options.out), name, tasks.describe(task), options)
+        _same_training(Run(options.out), name, tasks.describe(task), options)
         _resume(options.out, options.training.steps)
         return
     with TrainingDisplay(console, options.training.steps) as display:

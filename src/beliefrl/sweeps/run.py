@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
-from beliefrl import folders
+from beliefrl.folders import locked
 from beliefrl.stop import Requests, Stopped
 from beliefrl.sweeps import cluster, files, local
 from beliefrl.sweeps import plan as plans
@@ -133,4 +133,4 @@ def _lock(folder: pathlib.Path) -> Any:
         raise UserError(
             f"The sweep's folder {folder} cannot be made ({error.strerror}): choose another --out."
         ) from None
-    return folders.locked(folder, "is being swept")
+    return locked(folder, "is being swept")
