@@ -15,9 +15,10 @@ import jax
 import numpy as np
 import tyro
 
-from beliefrl import agents, phases
-from beliefrl.bench import Noise
-from beliefrl.checkpoint import Checkpoints
+from beliefrl import agents
+from beliefrl.runs.checkpoint import Checkpoints
+from beliefrl.training import phases
+from beliefrl.training.bench import Noise
 
 
 def main(name: str = "vrm", steps: int = 2_000, capacity: int = 200_000, rounds: int = 3) -> None:

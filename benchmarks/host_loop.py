@@ -15,9 +15,10 @@ import numpy as np
 import tyro
 from gymnasium import spaces
 
-from beliefrl import agents, host_loop, phases
-from beliefrl.bench import Noise
+from beliefrl import agents
 from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.training import host_loop, phases
+from beliefrl.training.bench import Noise
 
 
 class NoiseEnvironment(gymnasium.Env):

@@ -21,7 +21,8 @@ def ours() -> float:
     """Updates per second of beliefrl's sac-mlp."""
     import jax
 
-    from beliefrl import agents, phases, tasks
+    from beliefrl import agents, tasks
+    from beliefrl.training import phases
 
     agent, task = agents.make("sac-mlp", step_start_rl=1_000), tasks.make("pendulum")
     program = phases.compile_program(agent, task, capacity=1_000_000, episodes=1)

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from PIL import Image
 
 import beliefrl
-from beliefrl.drawing import paint
 from beliefrl.tasks.cartpole import CartPoleState
+from beliefrl.tasks.drawing import paint
 from beliefrl.tasks.pendulum import PendulumState
 from beliefrl.tasks.target_reaching import TargetReachingState
 

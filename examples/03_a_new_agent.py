@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 import beliefrl
 from beliefrl.agents.sac import SAC, Metrics
-from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState
+from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState
 from beliefrl.types import Spec, Step, Window, WindowShape, transitions
 
 

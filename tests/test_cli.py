@@ -54,7 +54,7 @@ def folders(tmp_path, monkeypatch):
     def begin(*_, **__):
         raise AssertionError("The mistake was not noticed.")
 
-    monkeypatch.setattr("beliefrl.phases.compile_program", begin)
+    monkeypatch.setattr("beliefrl.training.phases.compile_program", begin)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -99,5 +99,5 @@ def test_too_little_memory_is_said_in_one_sentence(folders, capsys, monkeypatch)
     def fail(*_, **__):
         raise MemoryError
 
-    monkeypatch.setattr("beliefrl.phases.compile_program", fail)
+    monkeypatch.setattr("beliefrl.training.phases.compile_program", fail)
     assert "not enough memory" in complaint(capsys, [*TRAIN.split(), "--out", "run"])

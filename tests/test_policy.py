@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 import beliefrl
-from beliefrl import agents, rollout, tasks
+from beliefrl import agents, tasks
 from beliefrl.policy import Policy
-from beliefrl.runs import Run
+from beliefrl.runs.run import Run
+from beliefrl.training import rollout
 from beliefrl.types import UserError
 
 SMALL = {

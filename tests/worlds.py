@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from beliefrl import agents, tasks
-from beliefrl.runs import Recorder, Run
+from beliefrl.runs.run import Recorder, Run
 from beliefrl.types import Spec, WindowShape, transitions
 
 TINY = {

@@ -2,7 +2,7 @@
 
 import json
 
-from beliefrl.runs import Run
+from beliefrl.runs.run import Run
 
 EVIL = "</script><img src=x onerror=alert(1)>"
 HOUR = {"started": "2026-01-01T10:00:00+00:00", "ended": "2026-01-01T11:00:00+00:00", "device": "cpu"}

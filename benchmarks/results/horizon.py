@@ -12,10 +12,10 @@ import sys
 import numpy as np
 
 import beliefrl
+from beliefrl.analysis.figures import figure, save
 from beliefrl.analysis.palette import AGENTS
-from beliefrl.episodes import Player
-from beliefrl.evaluation import restore_seed
-from beliefrl.figures import figure, save
+from beliefrl.training.evaluation import restore_seed
+from beliefrl.viewing.episodes import Player
 
 PICTURE = pathlib.Path(__file__).parents[2] / "docs" / "results" / "cartpole" / "horizon"
 EPISODES = range(8)

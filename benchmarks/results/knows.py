@@ -10,9 +10,9 @@ import sys
 import numpy as np
 from probe import fit, perceiver
 
-from beliefrl.episodes import Player
-from beliefrl.evaluation import restore_seed
+from beliefrl.training.evaluation import restore_seed
 from beliefrl.types import perception
+from beliefrl.viewing.episodes import Player
 
 EPISODES, FITTED = 24, 18
 STATE = ("x (m)", "x' (m/s)", "θ (rad)", "θ' (rad/s)")

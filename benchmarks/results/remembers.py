@@ -12,8 +12,8 @@ import sys
 import numpy as np
 from probe import fit, perceiver
 
-from beliefrl.episodes import Player
-from beliefrl.evaluation import restore_seed
+from beliefrl.training.evaluation import restore_seed
+from beliefrl.viewing.episodes import Player
 
 EPISODES = 300
 PRIZE = 5.0  # a larger reward is a target's

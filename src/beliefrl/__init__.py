@@ -13,24 +13,24 @@ from importlib.metadata import version
 from beliefrl.agents import Agent
 from beliefrl.agents import make as make_agent
 from beliefrl.analysis.curves import draw_curve
-from beliefrl.environment import TaskEnvironment, register
-from beliefrl.episodes import Trajectory, play
-from beliefrl.evaluation import evaluate, task_of
-from beliefrl.films import film, video
-from beliefrl.options import Options
 from beliefrl.policy import Policy, load
-from beliefrl.prediction import Predictions, draw_predictions, predictions
 from beliefrl.report import write_report
-from beliefrl.runs import Run
-from beliefrl.schedule import Event
-from beliefrl.stop import Stopped
+from beliefrl.runs.options import Options
+from beliefrl.runs.run import Run
 from beliefrl.sweeps.plan import Experiment, grid
 from beliefrl.sweeps.run import SweepStatus, sweep
 from beliefrl.tasks import Task, observe
 from beliefrl.tasks import make as make_task
+from beliefrl.tasks.environment import TaskEnvironment, register
 from beliefrl.tasks.gymnasium import GymnasiumTask
-from beliefrl.train import resume, train
+from beliefrl.training.evaluation import evaluate, task_of
+from beliefrl.training.schedule import Event
+from beliefrl.training.stop import Stopped
+from beliefrl.training.train import resume, train
 from beliefrl.types import Moment, Spec, Step, UserError, Window, WindowShape
+from beliefrl.viewing.episodes import Trajectory, play
+from beliefrl.viewing.films import film, video
+from beliefrl.viewing.prediction import Predictions, draw_predictions, predictions
 
 __version__ = version("beliefrl")
 register()  # gymnasium.make("BeliefRL/PendulumV-v0")

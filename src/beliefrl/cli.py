@@ -5,8 +5,8 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
-from beliefrl.arguments import UsageError
 from beliefrl.commands import COMMANDS
+from beliefrl.commands.arguments import UsageError
 
 HELP = """usage: beliefrl COMMAND ...
 

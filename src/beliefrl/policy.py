@@ -20,11 +20,11 @@ import numpy as np
 
 from beliefrl import agents
 from beliefrl.agents import Agent
-from beliefrl.arrays import write_whole
-from beliefrl.evaluation import restore_seed
-from beliefrl.runs import Run
+from beliefrl.runs.arrays import write_whole
+from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.training.evaluation import restore_seed
 from beliefrl.types import LARGEST, Spec, Step, UserError, short
 
 State = tuple[np.ndarray, ...]

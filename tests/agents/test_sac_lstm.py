@@ -9,8 +9,8 @@ import pytest
 
 from agents.moments import SPEC, along, changed_where_missing, differ, random_like, slope, windows
 from beliefrl.agents.sac_lstm import SACLSTMAgent
-from beliefrl.nets import LSTM, LSTMState, _lstm_loop, _lstm_scan, draw
-from beliefrl.soft_actor_critic import actor_loss, q_loss, state_value, value_loss
+from beliefrl.models.nets import LSTM, LSTMState, _lstm_loop, _lstm_scan, draw
+from beliefrl.models.soft_actor_critic import actor_loss, q_loss, state_value, value_loss
 from beliefrl.types import UserError, time_major
 
 AGENT = SACLSTMAgent(policy_layers=(8,), value_layers=(8,), d_size=8, seq_len=6, batch_size=2, burn_in=4)

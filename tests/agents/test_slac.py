@@ -7,7 +7,7 @@ import pytest
 
 from agents.moments import SPEC, along, changed_where_missing, differ, random_like, same, slope, windows
 from beliefrl.agents.slac import SLACAgent, begin_windows
-from beliefrl.latent_model import _loop, _scan, _zeros, elbo_terms
+from beliefrl.models.latent_model import _loop, _scan, _zeros, elbo_terms
 from beliefrl.types import UserError, perception, time_major
 
 AGENT = SLACAgent(
@@ -100,7 +100,7 @@ def test_the_loops_gradient_is_that_of_plain_differentiation(state, moments, noi
 
     step = moments.step
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("beliefrl.latent_model._loop", capture)
+        patch.setattr("beliefrl.models.latent_model._loop", capture)
         state.model.infer(perception(step), step.prev_action, step.is_first, noise)
 
     def plain(weights, given, is_first, noise):

@@ -11,9 +11,9 @@ import pytest
 from agents.moments import SMALL, SPEC, differ, same
 from beliefrl import agents
 from beliefrl.agents.vrm import VRMAgent
-from beliefrl.nets import draw, standardised, unscaled
+from beliefrl.models.nets import draw, standardised, unscaled
+from beliefrl.models.variational_model import VRM, Gaussian, Loop, LSTMState, _loop, _scan
 from beliefrl.types import Step, UserError, Window, check_choice, time_major
-from beliefrl.variational_model import VRM, Gaussian, Loop, LSTMState, _loop, _scan
 
 AGENT = VRMAgent(**SMALL)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from beliefrl.analysis.curves import draw_curve, evaluations, standard_error
-from beliefrl.runs import Run
+from beliefrl.runs.run import Run
 from beliefrl.types import UserError
 
 

@@ -11,11 +11,11 @@ import time
 import pytest
 
 from beliefrl import cli, sweep
-from beliefrl.runs import Run
-from beliefrl.stop import Stopped
+from beliefrl.runs.run import Run
 from beliefrl.sweeps import local
 from beliefrl.sweeps.plan import Experiment, Training, grid
 from beliefrl.sweeps.run import reason
+from beliefrl.training.stop import Stopped
 from beliefrl.types import UserError
 
 QUICK = {

@@ -7,9 +7,9 @@ import signal
 import pytest
 
 from beliefrl import sweep
-from beliefrl.stop import Stopped
 from beliefrl.sweeps import run as runs
 from beliefrl.sweeps.plan import Experiment, grid
+from beliefrl.training.stop import Stopped
 from beliefrl.types import UserError
 
 TWO = grid(["vrm"], ["pendulum", "cartpole"], seeds=2, steps=10)

@@ -6,9 +6,9 @@ import pytest
 from gymnasium import spaces
 
 from beliefrl import tasks
-from beliefrl.lockstep import Lockstep
 from beliefrl.tasks import gymnasium as adapter
 from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
+from beliefrl.training.lockstep import Lockstep
 from beliefrl.types import UserError
 from wrong import BOX, FAULTS, UNSUPPORTED, Dictionary, Fine, spaced
 

@@ -12,7 +12,7 @@ from beliefrl.agents.sac_lstm import SACLSTMAgent
 from beliefrl.agents.sac_mlp import SACMLPAgent
 from beliefrl.agents.slac import SLACAgent
 from beliefrl.agents.vrm import VRMAgent
-from beliefrl.nets import Gaussian
+from beliefrl.models.nets import Gaussian
 from beliefrl.types import Spec, Step, UserError, Window, WindowShape
 
 Metrics = dict[str, Float[Array, ""]]

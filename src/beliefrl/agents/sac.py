@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.nets import Scale, observe, standardised, tanh_gaussian
-from beliefrl.soft_actor_critic import (
+from beliefrl.models.nets import Scale, observe, standardised, tanh_gaussian
+from beliefrl.models.soft_actor_critic import (
     Batch,
     Controller,
     Optimisers,

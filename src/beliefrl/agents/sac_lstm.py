@@ -17,9 +17,9 @@ import optax
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents.sac import SAC, Metrics, for_each_update, split_updates
-from beliefrl.nets import LSTM, LSTMState, descend, draw
-from beliefrl.returns import transition_batch
-from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState, soft_update, update
+from beliefrl.models.nets import LSTM, LSTMState, descend, draw
+from beliefrl.models.returns import transition_batch
+from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState, soft_update, update
 from beliefrl.types import WIDEST, Spec, Step, Window, WindowShape, check_range, time_major, transitions
 
 

@@ -11,9 +11,9 @@ import jax
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents.sac import SAC, Metrics, for_each_update, standardise_beliefs
-from beliefrl.nets import Scale, standardised, unscaled
-from beliefrl.returns import transition_batch
-from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState
+from beliefrl.models.nets import Scale, standardised, unscaled
+from beliefrl.models.returns import transition_batch
+from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState
 from beliefrl.types import Spec, Step, Window, WindowShape, check_range, time_major, transitions
 
 

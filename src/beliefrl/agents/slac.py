@@ -19,10 +19,10 @@ import optax
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents.sac import SAC, Metrics, split_updates
-from beliefrl.latent_model import LatentModel, Latents, elbo_terms, predict
-from beliefrl.nets import Gaussian, descend, draw
-from beliefrl.returns import transition_batch
-from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean
+from beliefrl.models.latent_model import LatentModel, Latents, elbo_terms, predict
+from beliefrl.models.nets import Gaussian, descend, draw
+from beliefrl.models.returns import transition_batch
+from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean
 from beliefrl.types import (
     WIDEST,
     Spec,

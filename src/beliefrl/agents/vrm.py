@@ -22,9 +22,10 @@ import optax
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents.sac import SAC, Metrics, split_updates, standardise_beliefs
-from beliefrl.nets import Gaussian, LSTMState, Scale, descend, draw, standardised, unscaled
-from beliefrl.returns import transition_batch
-from beliefrl.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean
+from beliefrl.models.nets import Gaussian, LSTMState, Scale, descend, draw, standardised, unscaled
+from beliefrl.models.returns import transition_batch
+from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean
+from beliefrl.models.variational_model import VRM, elbo_terms, predict, prediction_error
 from beliefrl.types import (
     WIDEST,
     Spec,
@@ -38,7 +39,6 @@ from beliefrl.types import (
     time_major,
     transitions,
 )
-from beliefrl.variational_model import VRM, elbo_terms, predict, prediction_error
 
 
 class Memory(NamedTuple):

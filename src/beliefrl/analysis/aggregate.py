@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from beliefrl.analysis.figures import figure, save
 from beliefrl.analysis.groups import Group
 from beliefrl.analysis.palette import colours
 from beliefrl.analysis.panels import add_legend, counts, legend_height, tasks_of, with_curve
-from beliefrl.figures import figure, save
 from beliefrl.types import UserError
 
 Scores = Sequence[Float[np.ndarray, " seed"]]  # for each task

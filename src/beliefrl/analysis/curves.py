@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from beliefrl.figures import figure
-from beliefrl.runs import Row, Run
+from beliefrl.analysis.figures import figure
+from beliefrl.runs.run import Row, Run
 from beliefrl.types import UserError
 
 COLOURS = {"sampled": "#1f6f8b", "mode": "#c8553d"}

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from beliefrl.analysis.curves import means_between
+from beliefrl.analysis.figures import save
 from beliefrl.analysis.groups import Curve, Group
 from beliefrl.analysis.palette import colours
 from beliefrl.analysis.panels import add_legend, draw_line, finish, panels, spread, with_curve
 from beliefrl.analysis.results import MODEL_LOSSES
-from beliefrl.figures import save
 from beliefrl.types import UserError
 
 GREY = "#444444"

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from beliefrl.analysis import results
-from beliefrl.runs import Row, Run
+from beliefrl.runs.run import Row, Run
 from beliefrl.types import UserError
 
 Seed = tuple[Run, int]  # a run and the number of one of its seeds

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from beliefrl.analysis.curves import standard_error
+from beliefrl.analysis.figures import figure, save
 from beliefrl.analysis.groups import Curve, Group
 from beliefrl.analysis.palette import colours, dashes
-from beliefrl.figures import figure, save
 from beliefrl.types import UserError
 
 COLUMNS = 3

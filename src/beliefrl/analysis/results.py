@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from beliefrl.analysis.curves import means_between
-from beliefrl.arrays import write_whole
-from beliefrl.runs import Row, Run
+from beliefrl.runs.arrays import write_whole
+from beliefrl.runs.run import Row, Run
 from beliefrl.types import UserError
 
 ENDING = ".json.gz"

@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from beliefrl import arrays
 from beliefrl.analysis.groups import Group, last_step
 from beliefrl.analysis.tables import Column, write_table
-from beliefrl.runs import Run
+from beliefrl.runs import arrays
+from beliefrl.runs.run import Run
 
 STEPS = 100_000  # of the paper's table
 

@@ -4,7 +4,7 @@ import pathlib
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from beliefrl.arrays import write_whole
+from beliefrl.runs.arrays import write_whole
 from beliefrl.types import UserError
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from beliefrl.arguments import agent_name, agent_options, parse
+from beliefrl.commands.arguments import agent_name, agent_options, parse
 
 STARTED = time.time()
 
@@ -28,7 +28,7 @@ def bench(argv: Sequence[str]) -> None:
         "json": option(bool, False, "Print one JSON object."),
     }
     options = parse(agent_options(None if name == "all" else agents.find(name), own), rest, f"beliefrl bench {name}")
-    from beliefrl.bench import bench as run_bench
+    from beliefrl.training.bench import bench as run_bench
 
     sizes = (options.obs, options.actions, options.seeds)
     if name == "all":
@@ -40,7 +40,7 @@ def bench(argv: Sequence[str]) -> None:
     elif name == "all":
         from rich.console import Console
 
-        from beliefrl.display import scalability_table
+        from beliefrl.commands.display import scalability_table
 
         Console().print(scalability_table(results, options.obs, options.actions))
     else:

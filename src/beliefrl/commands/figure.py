@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from beliefrl.arguments import UsageError, parse
+from beliefrl.commands.arguments import UsageError, parse
 
 KINDS = ("curves", "run", "ablation", "sensitivity", "elbo", "aggregate", "scalability", "table")
 TABLES = ("scalability", "table")
@@ -77,8 +77,8 @@ def _draw(kind: str, runs: Sequence[Any], out: pathlib.Path, actions: str) -> pa
     from beliefrl import agents
     from beliefrl.analysis import aggregate, elbo, final, panels, scalability
     from beliefrl.analysis.curves import curve_figure
+    from beliefrl.analysis.figures import save
     from beliefrl.analysis.groups import groups
-    from beliefrl.figures import save
     from beliefrl.sweeps import presets
     from beliefrl.types import UserError
 

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 
-from beliefrl.arguments import parse
+from beliefrl.commands.arguments import parse
 
 
 @dataclasses.dataclass(frozen=True)

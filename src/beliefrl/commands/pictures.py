@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from beliefrl.arguments import parse
+from beliefrl.commands.arguments import parse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,9 +83,9 @@ class FilmOptions:
 def predict(argv: Sequence[str]) -> None:
     """`beliefrl predict RUN ...`."""
     options = parse(PredictOptions, argv, "beliefrl predict")
-    from beliefrl import figures
-    from beliefrl.prediction import draw_predictions, predictions
-    from beliefrl.runs import Run
+    from beliefrl.analysis import figures
+    from beliefrl.runs.run import Run
+    from beliefrl.viewing.prediction import draw_predictions, predictions
 
     run = Run(options.run)
     path = options.out or run.folder / "predictions.png"
@@ -98,7 +98,7 @@ def predict(argv: Sequence[str]) -> None:
 def video(argv: Sequence[str]) -> None:
     """`beliefrl video RUN FILE ...`."""
     options = parse(VideoOptions, argv, "beliefrl video")
-    from beliefrl import films
+    from beliefrl.viewing import films
 
     names = ("seed", "episode_seed", "sampled", "episodes", "fps", "steps")
     played = films.video(options.run, options.out, **{name: getattr(options, name) for name in names})
@@ -112,7 +112,7 @@ def video(argv: Sequence[str]) -> None:
 def film(argv: Sequence[str]) -> None:
     """`beliefrl film RUN ...`."""
     options = parse(FilmOptions, argv, "beliefrl film")
-    from beliefrl import films
+    from beliefrl.viewing import films
 
     names = ("frames", "seed", "episode_seed", "sampled", "steps")
     _written(films.film(options.runs, options.out, **{name: getattr(options, name) for name in names}))

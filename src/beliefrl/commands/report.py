@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from beliefrl.arguments import UsageError, parse
+from beliefrl.commands.arguments import UsageError, parse
 
 
 @dataclasses.dataclass(frozen=True)

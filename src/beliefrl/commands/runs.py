@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from beliefrl.arguments import parse
+from beliefrl.commands.arguments import parse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,9 +50,9 @@ def show(argv: Sequence[str]) -> None:
     options = parse(ShowOptions, argv, "beliefrl show")
     from rich.console import Console
 
-    from beliefrl.display import results_table, run_table
-    from beliefrl.evaluation import agent_of
-    from beliefrl.runs import Run
+    from beliefrl.commands.display import results_table, run_table
+    from beliefrl.runs.run import Run
+    from beliefrl.training.evaluation import agent_of
 
     run, console = Run(options.run), Console()
     table, results = run_table(run, agent_of(run)), run.results()
@@ -68,9 +68,9 @@ def evaluate(argv: Sequence[str]) -> None:
     options = parse(EvaluateOptions, argv, "beliefrl evaluate")
     from rich.console import Console
 
-    from beliefrl.display import results_table
-    from beliefrl.evaluation import evaluate as play
-    from beliefrl.runs import Run
+    from beliefrl.commands.display import results_table
+    from beliefrl.runs.run import Run
+    from beliefrl.training.evaluation import evaluate as play
 
     run = Run(options.run)
     results = play(run, options.episodes, options.seed)

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from beliefrl.arguments import UsageError, named_values, parse
+from beliefrl.commands.arguments import UsageError, named_values, parse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +56,7 @@ def sweep(argv: Sequence[str]) -> None:
     options = parse(SweepOptions, argv, "beliefrl sweep")
     from rich.console import Console
 
-    from beliefrl.display import SweepDisplay
+    from beliefrl.commands.display import SweepDisplay
     from beliefrl.sweeps.run import sweep as run_sweep
 
     experiments = _experiments(options)
@@ -75,7 +75,7 @@ def sweep(argv: Sequence[str]) -> None:
 
 def _experiments(options: SweepOptions) -> list:
     """What the command line asks for."""
-    from beliefrl.options import Options
+    from beliefrl.runs.options import Options
     from beliefrl.sweeps import files, plan, presets
     from beliefrl.types import check_range
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from beliefrl.arguments import agent_name, agent_options, named_values, parse
+from beliefrl.commands.arguments import agent_name, agent_options, named_values, parse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,10 +27,10 @@ def train(argv: Sequence[str]) -> None:
     from rich.console import Console
 
     from beliefrl import agents, tasks
-    from beliefrl.display import TrainingDisplay
-    from beliefrl.options import Options
-    from beliefrl.runs import Run
-    from beliefrl.train import train as run_training
+    from beliefrl.commands.display import TrainingDisplay
+    from beliefrl.runs.options import Options
+    from beliefrl.runs.run import Run
+    from beliefrl.training.train import train as run_training
 
     name, rest = agent_name(argv, "train", "TASK")
     options_type = agent_options(
@@ -93,7 +93,7 @@ def _ended(run: Any) -> None:
     """What a finished training is worth, and where it lies."""
     from rich.console import Console
 
-    from beliefrl.display import results_table
+    from beliefrl.commands.display import results_table
 
     console, results = Console(), run.results() or {}
     title = f"{run.config['agent']} on {run.config['task']} after {results['step']:,} steps"
@@ -123,9 +123,9 @@ def resume(argv: Sequence[str]) -> None:
 def _resume(folder: pathlib.Path, steps: int | None) -> None:
     from rich.console import Console
 
-    from beliefrl.display import TrainingDisplay
-    from beliefrl.runs import Run
-    from beliefrl.train import resume as go_on
+    from beliefrl.commands.display import TrainingDisplay
+    from beliefrl.runs.run import Run
+    from beliefrl.training.train import resume as go_on
 
     run = Run(folder)
     with TrainingDisplay(Console(), steps or run.options.steps) as display:

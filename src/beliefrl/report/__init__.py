@@ -19,8 +19,8 @@ from string import Template
 from typing import Any
 
 from beliefrl.analysis.groups import find
-from beliefrl.arrays import write_whole
 from beliefrl.report.data import ReadOnce, told
+from beliefrl.runs.arrays import write_whole
 from beliefrl.types import UserError
 
 

@@ -15,8 +15,8 @@ from beliefrl.analysis.curves import standard_error
 from beliefrl.analysis.groups import Curve, Group, groups, is_finished, last_step
 from beliefrl.analysis.palette import colours, dashes
 from beliefrl.analysis.scalability import wall_clock
-from beliefrl.evaluation import MODES
-from beliefrl.runs import Row, Run
+from beliefrl.runs.run import Row, Run
+from beliefrl.training.evaluation import MODES
 
 MEDIA = (".mp4", ".webm", ".gif")
 PICTURE = "curve.png"

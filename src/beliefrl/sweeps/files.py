@@ -7,7 +7,7 @@ import os
 import pathlib
 from collections.abc import Sequence
 
-from beliefrl.arrays import write_whole
+from beliefrl.runs.arrays import write_whole
 from beliefrl.sweeps.plan import Experiment, Training
 from beliefrl.types import UserError, said
 

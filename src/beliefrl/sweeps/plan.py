@@ -18,9 +18,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from beliefrl import agents, tasks
-from beliefrl.options import Options
-from beliefrl.runs import Run
-from beliefrl.schedule import capacity
+from beliefrl.runs.options import Options
+from beliefrl.runs.run import Run
+from beliefrl.training.schedule import capacity
 from beliefrl.types import UserError
 
 OPTIONS = tuple(field.name for field in dataclasses.fields(Options))

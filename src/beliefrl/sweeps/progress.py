@@ -5,7 +5,7 @@ import statistics
 import time
 from typing import NamedTuple
 
-from beliefrl.runs import Run
+from beliefrl.runs.run import Run
 from beliefrl.sweeps.plan import Training
 from beliefrl.sweeps.run import SweepStatus
 from beliefrl.types import UserError

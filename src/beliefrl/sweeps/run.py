@@ -7,11 +7,11 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
-from beliefrl.folders import locked
-from beliefrl.stop import Requests, Stopped
+from beliefrl.runs.folder import locked
 from beliefrl.sweeps import cluster, files, local
 from beliefrl.sweeps import plan as plans
 from beliefrl.sweeps.plan import Experiment, Training
+from beliefrl.training.stop import Requests, Stopped
 from beliefrl.types import UserError
 
 LOOK_EVERY = 0.5  # seconds

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.drawing import BLUE, GREY, INK, PALE, RED, Circle, Line, Picture, Polygon
+from beliefrl.tasks.drawing import BLUE, GREY, INK, PALE, RED, Circle, Line, Picture, Polygon
 from beliefrl.types import Spec, check_range
 
 START = 0.05  # an episode begins with all four numbers in [-START, START]

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.drawing import BLUE, INK, PALE, Circle, Line, Picture
+from beliefrl.tasks.drawing import BLUE, INK, PALE, Circle, Line, Picture
 from beliefrl.types import Spec, check_range
 
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from beliefrl.drawing import BLUE, GREEN, GREY, INK, PALE, PAPER, RED, Circle, Line, Picture, Polygon
+from beliefrl.tasks.drawing import BLUE, GREEN, GREY, INK, PALE, PAPER, RED, Circle, Line, Picture, Polygon
 from beliefrl.types import Spec, check_range
 
 

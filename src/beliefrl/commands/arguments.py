@@ -1,0 +1,110 @@
+"""What stands behind a command: its options, read with tyro, and its mistakes, put as sentences."""
+
+import contextlib
+import dataclasses
+import difflib
+import io
+import json
+import re
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import tyro
+
+from beliefrl.commands.values import VALUES
+
+
+class UsageError(Exception):
+    """A mistake on the command line, as a sentence."""
+
+
+def agent_options(agent: Any, own: dict[str, Any]) -> type:
+    """The options of a command: its own, (type, default) each, and the hyperparameters of an agent, if there is one."""
+    fields = [(name, kind, dataclasses.field(default=default)) for name, (kind, default) in own.items()]
+    if agent is None:
+        return dataclasses.make_dataclass("Options", fields, frozen=True)
+    hyperparameters = Annotated[type(agent), tyro.conf.arg(name="", help="Hyperparameters of the agent.")]
+    fields.append(("agent", hyperparameters, dataclasses.field(default=agent)))
+    return dataclasses.make_dataclass("Options", fields, frozen=True)
+
+
+def agent_name(argv: Sequence[str], command: str, more: str = "") -> tuple[str, Sequence[str]]:
+    """The agent's name and what follows it."""
+    usage = f"beliefrl {command} AGENT {more}".rstrip()
+    if argv and argv[0] in ("-h", "--help"):
+        print(f"usage: {usage} ...\n")
+        print(f"`beliefrl agents` lists the agents; name one to see its options: beliefrl {command} vrm --help")
+        raise SystemExit(0)
+    if not argv or argv[0].startswith("-"):
+        raise UsageError(f"No agent is named: write {usage}; `beliefrl agents` lists them.")
+    return argv[0], argv[1:]
+
+
+def parse(options: Any, argv: Sequence[str], prog: str) -> Any:
+    """Options from the command line; a mistake becomes a sentence instead of tyro's box."""
+    if any(arg in ("-h", "--help") for arg in argv):
+        return tyro.cli(options, prog=prog, args=argv, registry=VALUES)
+    box = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(box), contextlib.redirect_stdout(box):
+            parsed, unknown = tyro.cli(options, prog=prog, args=argv, return_unknown_args=True, registry=VALUES)
+    except SystemExit:
+        raise UsageError(f"{_sentence(box.getvalue())}; `{prog} --help` shows what can be given.") from None
+    if unknown:
+        raise UsageError(_unknown(options, unknown[0], prog))
+    return parsed
+
+
+def named_values(given: Sequence[str], option: str) -> dict[str, Any]:
+    """{"name": value} of NAME=VALUE; a value is read as JSON, or else it is a string."""
+    values = {}
+    for each in given:
+        name, separator, value = each.partition("=")
+        if not (separator and name.isidentifier()):
+            raise UsageError(f"{option} {each} cannot be understood: write NAME=VALUE, such as max_episode_steps=500.")
+        if name in ("name", "observe"):  # arguments of `tasks.make` beside the constants
+            raise UsageError(f"{option} {each} is impossible: the task's name and --observe are given apart.")
+        try:
+            values[name] = json.loads({"True": "true", "False": "false", "None": "null"}.get(value, value))
+        except ValueError:
+            values[name] = value
+    return values
+
+
+WORDING = (  # tyro's, Python's, and ours
+    (r"Missing from .*: (\w+) .*", r"\1 is missing"),
+    (r"Error parsing (\S+): (must be .*)", r"\1 \2"),
+    (r"Error parsing (\S+): could not convert string to float: (.*)", r"\1 must be a number, not \2"),
+    (r"Error parsing (\S+): .* \[(.*)\]", r"\1 cannot be \2"),
+    (r"invalid choice (.*) for argument '(\S+)'. Expected one of \((.*)\)", r"\2 must be one of \3, not \1"),
+    (r"Missing value for argument '(\S+)'.*", r"\1 needs a value"),
+)
+
+
+def _sentence(box: str) -> str:
+    """The first paragraph below the title of a box that tyro drew, on one line and in our words."""
+    lines = [line.strip(" │|╭╮╰╯─-") for line in box.splitlines()[1:]]  # rules become empty
+    paragraphs = " ".join(line or "\n" for line in lines).split("\n")
+    message = next(filter(str.strip, paragraphs), "That command line cannot be understood").strip().rstrip(". ")
+    for theirs, ours in WORDING:
+        message = re.sub(f"^{theirs}$", ours, message)
+    return message
+
+
+def _unknown(options: Any, given: str, prog: str) -> str:
+    """What to say of an argument that no option takes."""
+    if not given.startswith("-"):
+        return f"There is one argument too many, {given!r}: `{prog} --help` shows what can be given."
+    names = [f"--{name.replace('_', '-')}" for name in _option_names(options)]
+    near = difflib.get_close_matches(given.split("=")[0], names, n=1)
+    hint = f"did you mean {near[0]}?" if near else f"`{prog} --help` shows them."
+    return f"There is no option {given}: {hint}"
+
+
+def _option_names(options: Any) -> list[str]:
+    """Every field of a dataclass and of the dataclasses in it."""
+    names = []
+    for field in dataclasses.fields(options):
+        kind = getattr(field.type, "__origin__", field.type)
+        names += _option_names(kind) if dataclasses.is_dataclass(kind) else [field.name]
+    return names

@@ -1,0 +1,78 @@
+"""The transitions of windows as the controller learns from them: one step long (the paper), or n.
+
+With n steps the critics are trained towards
+
+    r_t + γ r_{t+1} + ... + γ^{m-1} r_{t+m-1} + γ^m V̄(s_{t+m}),    m ≤ n
+
+where m is n, or as many steps as are left of the episode or the window. What V̄ has learned then reaches Q in n times
+fewer updates. The actions on the way are those that were taken, by policies of old, and their entropy is not counted:
+the target is biased, and the more so the larger n is.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from beliefrl.models.soft_actor_critic import Batch
+from beliefrl.types import Step
+
+
+class Returns(NamedTuple):
+    """What the transitions that begin at each moment of windows (time-major) lead to."""
+
+    end: Int[Array, "length batch"]  # index of s_{t+m} among the windows' moments
+    reward: Float[Array, "length batch"]  # discounted sum of the m rewards
+    terminated: Bool[Array, "length batch"]  # s_{t+m} is terminal
+    discount: Float[Array, "length batch"]  # γ^m
+
+
+def n_step_returns(step: Step, valid: Bool[Array, "length batch"], n: int, gamma: float) -> Returns:
+    """The returns of `length` transitions, given the length + 1 moments between which they lie.
+
+    `valid` says which neighbours are transitions; of those that are not, what is returned means nothing.
+    """
+    length = valid.shape[0]
+    first = jnp.broadcast_to(jnp.arange(length)[:, None], valid.shape)
+    end, total, terminated = first + 1, step.reward[1:], step.terminated[1:]
+    discount, goes_on = jnp.full(total.shape, gamma), valid & ~terminated
+    for ahead in range(1, min(n, length)):
+        reward, ends, follows = (_shifted(leaf, ahead) for leaf in (step.reward[1:], step.terminated[1:], valid))
+        goes_on = goes_on & follows
+        end, total = end + goes_on, total + jnp.where(goes_on, gamma**ahead * reward, 0.0)
+        discount = jnp.where(goes_on, gamma ** (ahead + 1), discount)
+        terminated = terminated | (goes_on & ends)
+        goes_on = goes_on & ~ends
+    return Returns(end, total, terminated, discount)
+
+
+def _shifted(leaf: Array, ahead: int) -> Array:
+    """What lies `ahead` steps later; zero (or False) where the window has ended."""
+    return jnp.concatenate([leaf[ahead:], jnp.zeros_like(leaf[:ahead])])
+
+
+def transition_batch(
+    step: Step,
+    valid: Bool[Array, "length batch"],
+    belief: Float[Array, "time batch belief"],
+    next_belief: Float[Array, "time batch belief"],
+    n: int,
+    gamma: float,
+    seen: Float[Array, "time batch seen"] | None = None,
+) -> Batch:
+    """The transitions between length + 1 moments of windows (time-major), leaves (length, batch, ...).
+
+    `next_belief` holds the beliefs that V̄ reads, at the same moments; `seen` what the actor reads where not `belief`.
+    """
+    returns = n_step_returns(step, valid, n, gamma)
+    after = next_belief[1:] if n == 1 else jnp.take_along_axis(next_belief, returns.end[..., None], axis=0)
+    return Batch(
+        belief=belief[:-1],
+        next_belief=after,
+        action=step.prev_action[1:],
+        reward=returns.reward,
+        terminated=returns.terminated,
+        valid=valid,
+        seen=None if seen is None else seen[:-1],
+        discount=returns.discount,
+    )

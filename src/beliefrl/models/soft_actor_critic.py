@@ -1,0 +1,223 @@
+"""Soft actor-critic on a belief: two Q networks, V, its slowly moving target, and a learned temperature.
+
+Source: Section 3.3 of the paper (after Haarnoja et al. 2018, 2019), with s the belief:
+
+    J_V = E ½ (V(s) - (min_i Q_i(s, ã) - α log π(ã|s)))²
+    J_Q = E ½ (Q_i(s, a) - (r + γ (1 - terminated) V̄(s')))²,  summed over i
+    J_π = E α log π(ã|s) - min_i Q_i(s, ã)  +  regulariser · ½ E (μ² + σ²)
+    J_α = E -log α (log π(ã|s) + H_target)
+
+ã is one sample, used wherever an action is sampled. Departures, both from the authors' code: the regulariser, and
+log α in place of α in J_α, which is the same descent at another speed. A time limit is no termination. In each loss
+the differentiated argument comes first, and means are over valid transitions.
+"""
+
+from typing import Any, NamedTuple, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Key
+
+from beliefrl.models.nets import MLP, descend, draw, tanh_gaussian
+
+LOG_SIGMA_MIN, LOG_SIGMA_MAX = -20.0, 2.0
+
+
+Network = TypeVar("Network")
+
+
+class Actor(eqx.Module):
+    """π(a|s): a Gaussian squashed by tanh, with separate networks for its mean and log σ."""
+
+    mean: MLP
+    log_sigma: MLP
+
+    def __init__(self, belief: int, action: int, layers: tuple[int, ...]):
+        self.mean = MLP((belief, *layers, action), jax.nn.relu)
+        self.log_sigma = MLP((belief, *layers, action), jax.nn.relu)
+
+    def __call__(self, belief: Float[Array, " belief"]) -> tuple[Float[Array, " action"], Float[Array, " action"]]:
+        """μ and log σ before the tanh, log σ clipped to [-20, 2]."""
+        return self.mean(belief), jnp.clip(self.log_sigma(belief), LOG_SIGMA_MIN, LOG_SIGMA_MAX)
+
+
+def q_value(
+    critic: MLP, belief: Float[Array, "batch belief"], action: Float[Array, "batch action"]
+) -> Float[Array, " batch"]:
+    """Q(s, a). The first layer is taken apart so that one W_s s serves Q(s, a) and Q(s, ã)."""
+    first, size = critic.layers[0], belief.shape[-1]
+    seen = belief @ first.weight[:, :size].T
+    return jax.vmap(lambda s, a: critic.rest(s + first.weight[:, size:] @ a + first.bias)[0])(seen, action)
+
+
+def state_value(value: MLP, belief: Float[Array, "batch belief"]) -> Float[Array, " batch"]:
+    """V(s)."""
+    return jax.vmap(value)(belief)[:, 0]
+
+
+class Controller(NamedTuple):
+    """Everything that J_V, J_Q, J_π and J_α train."""
+
+    actor: Actor
+    critics: tuple[MLP, MLP]  # Q_1, Q_2
+    value: MLP
+    target_value: MLP
+    log_alpha: Float[Array, ""]
+
+    def q(self, belief: Float[Array, "batch belief"], action: Float[Array, "batch action"]) -> Float[Array, " batch"]:
+        """min_i Q_i(s, a)."""
+        return jnp.minimum(*(q_value(critic, belief, action) for critic in self.critics))
+
+
+class Batch(NamedTuple):
+    """Transitions for one update."""
+
+    belief: Float[Array, "batch belief"]  # s_t
+    next_belief: Float[Array, "batch belief"]  # s_{t+1}; s_{t+m} with returns of m steps (`returns`)
+    action: Float[Array, "batch action"]  # a_t
+    reward: Float[Array, " batch"]  # r_t, or the discounted sum of m of them
+    terminated: Bool[Array, " batch"]  # `next_belief` is terminal
+    valid: Bool[Array, " batch"]  # what is not counts nowhere
+    seen: Float[Array, "batch seen"] | None = None  # what the actor reads where that is not s_t (SLAC)
+    discount: Float[Array, " batch"] | None = None  # γ^m of what lies beyond; None: γ
+
+
+def init_controller(
+    belief: int,
+    action: int,
+    policy_layers: tuple[int, ...],
+    value_layers: tuple[int, ...],
+    key: Key[Array, ""],
+    seen: int | None = None,
+    value_start: float = 0.0,
+) -> Controller:
+    """A new controller for beliefs and actions of these sizes; V̄ starts as V, log α at 0.
+
+    `seen` is the size of what the actor reads, where that is not the belief; `value_start` is added to V and Q.
+    """
+    actor = Actor(belief if seen is None else seen, action, policy_layers)
+    critic = MLP((belief + action, *value_layers, 1), jax.nn.relu)
+    value = MLP((belief, *value_layers, 1), jax.nn.relu)
+    controller = draw(key, Controller(actor, (critic, critic), value, value, jnp.zeros(())))
+    controller = eqx.tree_at(_last_biases, controller, replace_fn=lambda bias: bias + value_start)
+    return controller._replace(target_value=jax.tree.map(jnp.copy, controller.value))
+
+
+def _last_biases(controller: Controller) -> list[Any]:
+    return [network.layers[-1].bias for network in (*controller.critics, controller.value)]
+
+
+def valid_mean(x: Float[Array, " batch"], valid: Bool[Array, " batch"]) -> Float[Array, ""]:
+    """The mean over what is valid; 0 where nothing is."""
+    return jnp.sum(jnp.where(valid, x, 0.0)) / jnp.maximum(jnp.sum(valid), 1)
+
+
+def value_loss(
+    value: MLP, belief: Float[Array, "batch belief"], target: Float[Array, " batch"], valid: Bool[Array, " batch"]
+) -> Float[Array, ""]:
+    """J_V, given the target min_i Q_i(s, ã) - α log π(ã|s)."""
+    return valid_mean(0.5 * (state_value(value, belief) - target) ** 2, valid)
+
+
+def q_loss(critics: tuple[MLP, MLP], target_value: MLP, batch: Batch, gamma: float) -> Float[Array, ""]:
+    """J_Q of both critics, summed."""
+    discount = gamma if batch.discount is None else batch.discount
+    beyond = jnp.where(batch.terminated, 0.0, state_value(target_value, batch.next_belief))
+    target = jax.lax.stop_gradient(batch.reward + discount * beyond)
+    errors = [q_value(critic, batch.belief, batch.action) - target for critic in critics]
+    return valid_mean(0.5 * errors[0] ** 2 + 0.5 * errors[1] ** 2, batch.valid)
+
+
+def actor_loss(
+    actor: Actor, controller: Controller, batch: Batch, noise: Float[Array, "batch action"], regulariser: float
+) -> tuple[Float[Array, ""], tuple[Float[Array, " batch"], Float[Array, " batch"]]]:
+    """J_π; beside it min_i Q_i(s, ã) and log π(ã|s). The belief that Q reads is held still: Q is not to improve."""
+    mean, log_sigma = jax.vmap(actor)(batch.belief if batch.seen is None else batch.seen)
+    action, log_prob = jax.vmap(tanh_gaussian)(mean, log_sigma, noise)
+    q = controller.q(jax.lax.stop_gradient(batch.belief), action)
+    size = jnp.mean(mean**2, axis=-1) + jnp.mean(jnp.exp(2 * log_sigma), axis=-1)
+    alpha = jnp.exp(controller.log_alpha)
+    return valid_mean(alpha * log_prob - q + 0.5 * regulariser * size, batch.valid), (q, log_prob)
+
+
+def alpha_loss(
+    log_alpha: Float[Array, ""], log_prob: Float[Array, " batch"], valid: Bool[Array, " batch"], target_entropy: float
+) -> Float[Array, ""]:
+    """J_α."""
+    return -log_alpha * valid_mean(log_prob + target_entropy, valid)
+
+
+def loss(
+    controller: Controller,
+    batch: Batch,
+    noise: Float[Array, "batch action"],
+    gamma: float,
+    regulariser: float,
+    target_entropy: float | None = None,
+) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
+    """J_π + J_V + J_Q + J_α, in each of which all that it does not train is held still; and what to log.
+
+    So its gradient is that of the four losses at the same parameters (V̄'s is zero), and where the beliefs are formed
+    by a network that learns as well (`sac-lstm`), the gradient of J_π, J_V and J_Q in it. `noise` is standard normal,
+    one vector a transition: the sample ã. `target_entropy` None is -DOF.
+    """
+    still = jax.lax.stop_gradient(controller)
+    j_pi, extras = actor_loss(controller.actor, still, batch, noise, regulariser)
+    q, log_prob = jax.lax.stop_gradient(extras)
+    alpha = jnp.exp(still.log_alpha)
+    j_v = value_loss(controller.value, batch.belief, q - alpha * log_prob, batch.valid)
+    j_q = q_loss(controller.critics, still.target_value, batch, gamma)
+    target_entropy = -float(batch.action.shape[-1]) if target_entropy is None else target_entropy
+    j_alpha = alpha_loss(controller.log_alpha, log_prob, batch.valid, target_entropy)
+    metrics = {
+        "loss_value": j_v,
+        "loss_q": j_q,
+        "loss_actor": j_pi,
+        "alpha": alpha,
+        "entropy": -valid_mean(log_prob, batch.valid),
+        "q": valid_mean(q, batch.valid),
+    }
+    return j_pi + j_v + j_q + j_alpha, metrics
+
+
+def soft_update(target: Network, value: Network, tau: float) -> Network:
+    """A target network, such as V̄, moves by the fraction τ towards the one that learns."""
+    return jax.tree.map(lambda old, new: old + tau * (new - old), target, value)
+
+
+class Optimisers(NamedTuple):
+    """Adam for each group that has a learning rate of its own in Table 1."""
+
+    actor: optax.GradientTransformation
+    critic: optax.GradientTransformation  # Q_1, Q_2 and V
+    alpha: optax.GradientTransformation
+
+
+class OptimiserState(NamedTuple):
+    actor: optax.OptState
+    critic: optax.OptState
+    alpha: optax.OptState
+
+
+def init_optimisers(optimisers: Optimisers, controller: Controller) -> OptimiserState:
+    """Fresh states for `update`."""
+    return OptimiserState(
+        optimisers.actor.init(controller.actor),  # pyright: ignore[reportArgumentType]
+        optimisers.critic.init((controller.critics, controller.value)),  # pyright: ignore[reportArgumentType]
+        optimisers.alpha.init(controller.log_alpha),
+    )
+
+
+def update(
+    optimisers: Optimisers, state: OptimiserState, controller: Controller, gradient: Controller, tau: float
+) -> tuple[Controller, OptimiserState]:
+    """One step of every optimiser, then of V̄ towards the new V."""
+    actor, s_actor = descend(optimisers.actor, gradient.actor, state.actor, controller.actor)
+    (critics, value), s_critic = descend(
+        optimisers.critic, (gradient.critics, gradient.value), state.critic, (controller.critics, controller.value)
+    )
+    log_alpha, s_alpha = descend(optimisers.alpha, gradient.log_alpha, state.alpha, controller.log_alpha)
+    target = soft_update(controller.target_value, value, tau)
+    return Controller(actor, critics, value, target, log_alpha), OptimiserState(s_actor, s_critic, s_alpha)

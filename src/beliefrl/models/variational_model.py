@@ -1,0 +1,275 @@
+"""The variational recurrent model (VRM): learns to predict perceptions, and so forms a recurrent state d.
+
+Source: Section 4.1, Appendix A.1. With x_t = (o_t, r_{t-1}), a_{t-1} the action before it, and [..] concatenation:
+
+    prior      p(z_t)  = N(μ_p, σ_p)[d_{t-1}, a_{t-1}]
+    posterior  q(z_t)  = N(μ_q, σ_q)[d_{t-1}, a_{t-1}, f_x(x_t)]
+    decoder    p(x_t)  = N(μ_x, σ_x)[d_{t-1}, z_t]
+    state      d_t     = LSTM(d_{t-1}; [f_x(x_t), z_t])
+    ELBO               = E_q log p(x_t) - D_KL(q(z_t) ‖ p(z_t))
+
+Speed decides the form. The posterior's first layers and the LSTM's gates are one layer, `Joint`, kept apart by what it
+multiplies: its products with f_x(x) and a are one batched product before the loop, prior and decoder run after it,
+and the loop keeps the products with d and z. The gradient of a weight inside the loop is one product after it
+(`_loop_backward`); plain differentiation would add up whole matrices at every step.
+
+Departure: one bias for each gate, where PyTorch's LSTM adds up two.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from beliefrl.models.nets import MLP, Gaussian, Linear, LSTMState, gaussian_kl, gaussian_log_prob, lstm_state
+
+SIGMA_X_MIN = 1e-3
+
+
+class Inferred(NamedTuple):
+    """An unroll of the inference model, leaves (time, batch, ...)."""
+
+    posterior: Gaussian  # of z_t
+    z: Float[Array, "time batch z"]
+    before: Float[Array, "time batch d"]  # d_{t-1}, zeros where an episode begins
+    state: LSTMState  # d_t and its cell
+
+
+class Joint(eqx.Module):
+    """The first layers of μ_q and σ_q and the four gates, side by side: (hidden, hidden, 4 d) = joint outputs.
+
+    Stored input by output, as the loop multiplies them; what an output does not read has no weights here.
+    """
+
+    by_d: Float[Array, "d joint"]
+    by_features: Float[Array, "hidden joint"]
+    by_action: Float[Array, "action 2*hidden"]  # the posterior alone
+    by_z: Float[Array, "z 4*d"]  # the gates alone
+    bias: Float[Array, " joint"]
+
+    def __init__(self, action: int, d: int, z: int, hidden: int):
+        posterior, gates = (d + action + hidden) ** -0.5, d**-0.5  # PyTorch's bounds for a linear layer and an LSTM
+        self.bias = jnp.concatenate([jnp.full(2 * hidden, posterior), jnp.full(4 * d, gates)])
+        self.by_d = jnp.tile(self.bias, (d, 1))
+        self.by_features = jnp.tile(self.bias, (hidden, 1))
+        self.by_action = jnp.full((action, 2 * hidden), posterior)
+        self.by_z = jnp.full((z, 4 * d), gates)
+
+    def given(
+        self,
+        features: Float[Array, "time batch hidden"],
+        prev_action: Float[Array, "time batch action"],
+        posterior_sees: bool = True,
+    ) -> Float[Array, "time batch joint"]:
+        """What the layer gets from f_x(x_t) and a_{t-1}; without f_x(x_t) for the posterior unless it sees it."""
+        posterior = prev_action @ self.by_action
+        gates = jnp.zeros((*posterior.shape[:-1], self.by_z.shape[1]))
+        by_features = self.by_features
+        if not posterior_sees:
+            by_features = by_features.at[:, : posterior.shape[-1]].set(0.0)
+        everything = features @ by_features + jnp.concatenate([posterior, gates], axis=-1)
+        return everything + jnp.broadcast_to(self.bias, everything.shape)
+
+
+class VRM(eqx.Module):
+    """The weights of one variational recurrent model."""
+
+    features: MLP  # f_x
+    joint: Joint
+    posterior_mean: Linear  # last layers of μ_q and σ_q
+    posterior_sigma: Linear
+    prior_mean: MLP
+    prior_sigma: MLP
+    decoder_mean: MLP
+    decoder_sigma: MLP
+    deterministic: bool = eqx.field(static=True)
+
+    def __init__(self, x: int, action: int, d: int, z: int, hidden: int, deterministic: bool = False):
+        """Widths: perception (observation and reward), action, d, z, and every hidden layer.
+
+        In a `deterministic` model posterior and prior are one, z_t = μ_q[d_{t-1}, a_{t-1}] (Appendix C); it does
+        not use its networks of the prior and of any σ.
+        """
+
+        def net(*sizes: int) -> MLP:
+            return MLP(sizes, jnp.tanh)
+
+        self.features = net(x, hidden, hidden)
+        self.joint = Joint(action, d, z, hidden)
+        self.posterior_mean, self.posterior_sigma = Linear(hidden, z), Linear(hidden, z)
+        self.prior_mean, self.prior_sigma = net(d + action, hidden, z), net(d + action, hidden, z)
+        self.decoder_mean, self.decoder_sigma = net(d + z, hidden, hidden, x), net(d + z, hidden, hidden, x)
+        self.deterministic = deterministic
+
+    def start(self, batch: int) -> LSTMState:
+        """The state in which episodes begin."""
+        zeros = jnp.zeros((batch, self.joint.by_d.shape[0]))
+        return LSTMState(zeros, zeros)
+
+    def prior(self, before: Float[Array, " d"], prev_action: Float[Array, " action"]) -> Gaussian:
+        """p(z_t | d_{t-1}, a_{t-1})."""
+        known = jnp.concatenate([before, prev_action])
+        return Gaussian(self.prior_mean(known), jax.nn.softplus(self.prior_sigma(known)))
+
+    def decode(self, before: Float[Array, " d"], z: Float[Array, " z"]) -> Gaussian:
+        """p(x_t | z_t, d_{t-1})."""
+        known = jnp.concatenate([before, z])
+        return Gaussian(self.decoder_mean(known), jax.nn.softplus(self.decoder_sigma(known)) + SIGMA_X_MIN)
+
+    def infer(
+        self,
+        start: LSTMState,
+        x: Float[Array, "time batch x"],
+        prev_action: Float[Array, "time batch action"],
+        is_first: Bool[Array, "time batch"],
+        noise: Float[Array, "time batch z"],
+    ) -> Inferred:
+        """Unroll the inference model with z_t = μ_q + σ_q · noise_t, from `start` and from zero wherever is_first."""
+        given = self.joint.given(jax.vmap(jax.vmap(self.features))(x), prev_action, not self.deterministic)
+        noise = jnp.zeros_like(noise) if self.deterministic else noise
+        weights = Loop(self.joint.by_d, self.joint.by_z, self.posterior_mean, self.posterior_sigma)
+        return _loop(weights, start, given, is_first, noise)
+
+    def next_state(self, state: LSTMState, x: Float[Array, " x"], z: Float[Array, " z"]) -> LSTMState:
+        """d_t and its cell, from d_{t-1} and its cell."""
+        joint, gates = self.joint, slice(-self.joint.by_z.shape[1], None)
+        given = self.features(x) @ joint.by_features[:, gates] + state.d @ joint.by_d[:, gates] + joint.bias[gates]
+        return LSTMState(*lstm_state(given + z @ joint.by_z, state.c))
+
+
+def predict(
+    vrm: VRM,
+    x: Float[Array, "time x"],
+    prev_action: Float[Array, "time action"],
+    seen: Bool[Array, " time"],
+    noise: tuple[Float[Array, "time z"], Float[Array, "time x"]],
+) -> Gaussian:
+    """p(x_t | z_t, d_{t-1}) along one episode from its first moment on, leaves (time, x).
+
+    Where x_t is `seen`, z_t is drawn from the posterior: open loop. Where it is not, z_t is drawn from the prior, and
+    the LSTM is fed with a draw of x_t from the decoder: closed loop. A deterministic model has σ = 0.
+    """
+
+    def step(state: LSTMState, inputs: tuple) -> tuple[LSTMState, Gaussian]:
+        x, prev_action, seen, (noise_z, noise_x) = inputs
+        moment = jax.tree.map(lambda leaf: leaf[None, None], (x, prev_action, jnp.array(False), noise_z))
+        z = vrm.infer(jax.tree.map(lambda leaf: leaf[None], state), *moment).z[0, 0]
+        if not vrm.deterministic:  # there posterior and prior are one
+            prior = vrm.prior(state.d, prev_action)
+            z = jnp.where(seen, z, prior.mean + prior.sigma * noise_z)
+        mean, sigma = vrm.decode(state.d, z)
+        sigma = jnp.zeros_like(sigma) if vrm.deterministic else sigma
+        return vrm.next_state(state, jnp.where(seen, x, mean + sigma * noise_x), z), Gaussian(mean, sigma)
+
+    start, x = jax.tree.map(lambda leaf: leaf[0], vrm.start(1)), jnp.where(seen[:, None], x, 0.0)
+    return jax.lax.scan(step, start, (x, prev_action, seen, noise))[1]
+
+
+class Terms(NamedTuple):
+    """The two terms of the ELBO at every step, each summed or averaged over its dimensions."""
+
+    kl: Float[Array, "time batch"]  # D_KL(q ‖ p)
+    log_likelihood: Float[Array, "time batch"]  # log p(x)
+
+
+def elbo_terms(
+    vrm: VRM,
+    inferred: Inferred,
+    x: Float[Array, "time batch x"],
+    prev_action: Float[Array, "time batch action"],
+    scaling: str = "mean",
+    prior_noise: Float[Array, "time batch z"] | None = None,
+) -> Terms:
+    """Both terms of the ELBO of an unroll.
+
+    `scaling` "mean" averages over the dimensions of z and x as the authors' code does (their learning rate was tuned
+    on it), "sum" is the paper's formula. With `prior_noise` z is drawn from the prior for decoding, as in their code.
+    """
+    prior = jax.vmap(jax.vmap(vrm.prior))(inferred.before, prev_action)
+    z = inferred.z if prior_noise is None else prior.mean + prior.sigma * prior_noise
+    decoded = jax.vmap(jax.vmap(vrm.decode))(inferred.before, z)
+    reduce = {"mean": jnp.mean, "sum": jnp.sum}[scaling]
+    kl = reduce(gaussian_kl(*inferred.posterior, *prior), axis=-1)
+    return Terms(kl, reduce(gaussian_log_prob(x, *decoded), axis=-1))
+
+
+def prediction_error(vrm: VRM, inferred: Inferred, x: Float[Array, "time batch x"]) -> Float[Array, "time batch"]:
+    """The squared error of a deterministic model's prediction of x_t, mean over its dimensions."""
+    predicted = jax.vmap(jax.vmap(vrm.decode))(inferred.before, inferred.z).mean
+    return jnp.mean((predicted - x) ** 2, axis=-1)
+
+
+class Loop(NamedTuple):
+    """The weights that stay inside the loop."""
+
+    by_d: Float[Array, "d joint"]
+    by_z: Float[Array, "z 4*d"]
+    mean: Linear
+    sigma: Linear
+
+
+class Hidden(NamedTuple):
+    """What the gradient of the loop's weights needs besides what `Inferred` holds, leaves (time, batch, ...)."""
+
+    mean: Float[Array, "time batch hidden"]
+    sigma: Float[Array, "time batch hidden"]
+
+
+def _cell(weights, state, given, zero, is_first, noise):
+    """One step. `zero` is added to the outputs of the posterior's last layers: its cotangent is theirs."""
+    before = jax.tree.map(lambda leaf: jnp.where(is_first[:, None], 0.0, leaf), state)
+    pre = given + before.d @ weights.by_d
+    hidden = weights.mean.weight.shape[1]
+    first = jnp.tanh(pre[:, : 2 * hidden])
+    hidden_mean, hidden_sigma = first[:, :hidden], first[:, hidden:]
+    mean = jax.vmap(weights.mean)(hidden_mean) + zero.mean
+    sigma = jax.nn.softplus(jax.vmap(weights.sigma)(hidden_sigma) + zero.sigma)
+    z = mean + sigma * noise
+    state = LSTMState(*lstm_state(pre[:, 2 * hidden :] + z @ weights.by_z, before.c))
+    return state, (Inferred(Gaussian(mean, sigma), z, before.d, state), Hidden(hidden_mean, hidden_sigma))
+
+
+def _scan(weights, start, given, zero, is_first, noise):
+    def step(state, inputs):
+        return _cell(weights, state, *inputs)
+
+    return jax.lax.scan(step, start, (given, zero, is_first, noise))[1]
+
+
+@jax.custom_vjp
+def _loop(weights, start, given, is_first, noise) -> Inferred:
+    return _scan(weights, start, given, Gaussian(jnp.zeros_like(noise), jnp.zeros_like(noise)), is_first, noise)[0]
+
+
+def _loop_forward(weights, start, given, is_first, noise):
+    zero = Gaussian(jnp.zeros_like(noise), jnp.zeros_like(noise))
+    (inferred, hidden), pullback = jax.vjp(
+        lambda start, given, zero: _scan(weights, start, given, zero, is_first, noise), start, given, zero
+    )
+    return inferred, (weights, inferred, hidden, pullback)
+
+
+def _loop_backward(saved, cotangent):
+    weights, inferred, hidden, pullback = saved
+    by_start, by_given, by_last = pullback((cotangent, jax.tree.map(jnp.zeros_like, hidden)))
+
+    def product(left, right):
+        return jnp.einsum("tbm,tbn->mn", left, right)
+
+    def layer(linear, inputs, outputs):
+        gradient = (product(outputs, inputs), jnp.sum(outputs, (0, 1)))
+        return eqx.tree_at(lambda layer: (layer.weight, layer.bias), linear, gradient)
+
+    by_gates = by_given[..., -weights.by_z.shape[1] :]
+    by_weights = Loop(
+        product(inferred.before, by_given),
+        product(inferred.z, by_gates),
+        layer(weights.mean, hidden.mean, by_last.mean),
+        layer(weights.sigma, hidden.sigma, by_last.sigma),
+    )
+    return by_weights, by_start, by_given, None, None
+
+
+_loop.defvjp(_loop_forward, _loop_backward)

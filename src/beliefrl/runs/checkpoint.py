@@ -1,0 +1,287 @@
+"""Checkpoints: all of a training on the disk, whole or not at all. Knows trees of arrays, no reinforcement learning.
+
+    checkpoints/
+      000004-step-12000/     appears by one rename, when everything it names is on the disk
+        manifest.json        {"content": {"format", "step", "progress", "files", "replay"}, "sha256": of the content}
+        state.safetensors    every array of the training but the replay's moments
+      replay/000003.safetensors   the moments that were added between two checkpoints; later checkpoints name it too
+
+A replay only grows at its end, so a checkpoint writes what is new in it, and its cost does not grow with the replay. Of
+each file the manifest has size and SHA-256, so a checkpoint that is cut short or changed on the disk is known, and the
+one before it is used. Files are plain numbers and JSON: reading them runs no code.
+"""
+
+import hashlib
+import json
+import os
+import pathlib
+import re
+import shutil
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from beliefrl.runs import arrays
+from beliefrl.runs.arrays import Damaged, sync_folder, write_whole
+from beliefrl.types import UserError
+
+FORMAT = 1
+NUMBER = "[0-9][0-9][0-9][0-9][0-9][0-9]"
+
+
+class Found(NamedTuple):
+    """A checkpoint that was read."""
+
+    step: int
+    progress: dict[str, Any]
+    tree: Any
+    moments: Any  # numpy, leaves (seed, capacity, ...)
+    passed_over: list[str]  # what is wrong with newer ones, a sentence each
+
+
+class Segment(NamedTuple):
+    """A file with moments of every seed: those numbered from `start` to `stop`, counted from the first ever added."""
+
+    file: str
+    start: list[int]
+    stop: list[int]
+    size: int
+    sha256: str
+
+
+class Checkpoints:
+    """The checkpoints of one run, written beside the training by a thread of its own."""
+
+    def __init__(self, folder: pathlib.Path, keep: int):
+        """In `folder`/checkpoints; the last `keep` are kept."""
+        self.folder, self.keep = folder / "checkpoints", keep
+        self._segments: list[Segment] = []
+        self._thread = ThreadPoolExecutor(1, "checkpoint")
+        self._writing: Future[None] | None = None
+
+    def save(self, step: int, progress: dict[str, Any], tree: Any, moments: Any, added: np.ndarray) -> None:
+        """Copy everything, and begin to write it.
+
+        Args:
+            step: by which the checkpoint is known.
+            progress: what else is needed to go on, as JSON has it.
+            tree: all arrays but the moments.
+            moments: leaves (seed, capacity, ...): a ring, whose last `added` were written in turn.
+            added: (seed,), moments ever added.
+
+        Raises:
+            UserError: the checkpoint before this one could not be written.
+        """
+        self.wait()
+        state, new = arrays.copied(tree), self._new_moments(moments, added)
+        self._writing = self._thread.submit(self._write, step, progress, state, new)
+
+    def forget_moments(self) -> None:
+        """The moments written so far have changed: the next checkpoint writes all of them anew."""
+        self.wait()
+        self._segments = []
+
+    def wait(self) -> None:
+        """Until what was begun is written.
+
+        Raises:
+            UserError: it could not be.
+        """
+        writing, self._writing = self._writing, None
+        if writing is None:
+            return
+        try:
+            writing.result()
+        except OSError as error:
+            raise UserError(
+                f"The checkpoint in {self.folder} cannot be written ({error.strerror}): mend that, then "
+                f"`beliefrl resume {self.folder.parent}` goes on."
+            ) from None
+
+    def close(self) -> None:
+        """Wait, and take no more."""
+        try:
+            self.wait()
+        finally:
+            self._thread.shutdown()
+
+    def __enter__(self) -> "Checkpoints":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self.abandon()
+
+    def keep_for(self, name: str) -> pathlib.Path | None:
+        """Keep the last checkpoint, whatever is written after it; returns where, or None where there is none."""
+        self.wait()
+        found = self._listed()
+        if not found:
+            return None
+        kept = self.folder / f"kept-for-{name}"
+        shutil.copytree(found[0], kept, copy_function=os.link, dirs_exist_ok=True)
+        return kept
+
+    def abandon(self) -> None:
+        """Take no more; what is being written is finished, what goes wrong in it concerns nobody any more."""
+        self._thread.shutdown()
+
+    # Writing
+
+    def _new_moments(self, moments: Any, added: np.ndarray) -> tuple[list[int], list[int], dict[str, np.ndarray]]:
+        """The moments that no file has yet; those of seeds with fewer new ones than others are padded."""
+        capacity = jax.tree.leaves(moments)[0].shape[1]
+        stop = [int(number) for number in added]
+        written = self._segments[-1].stop if self._segments else [0] * len(stop)
+        start = [max(old, new - capacity) for old, new in zip(written, stop, strict=True)]
+        longest = max(new - old for old, new in zip(start, stop, strict=True))
+        index = (np.array(start)[:, None] + np.arange(longest)) % capacity
+        seed = np.arange(len(stop))[:, None]
+        return start, stop, arrays.copied(jax.tree.map(lambda leaf: _on_host(leaf)[seed, index], moments))
+
+    def _write(self, step: int, progress: dict[str, Any], state: dict[str, np.ndarray], new: Any) -> None:
+        start, stop, moments = new
+        replay = self.folder / "replay"
+        replay.mkdir(parents=True, exist_ok=True)
+        if stop != (self._segments[-1].stop if self._segments else None):
+            path, content = replay / f"{_next_number(replay):06d}.safetensors", arrays.packed(moments)
+            write_whole(path, content)
+            self._segments.append(Segment(path.name, start, stop, len(content), _sha256(content)))
+        final = self.folder / f"{_next_number(self.folder):06d}-step-{step}"
+        temporary = self.folder / f".{final.name}.tmp"
+        for left in self.folder.glob(".*.tmp"):  # by a process that was killed
+            shutil.rmtree(left)
+        temporary.mkdir()
+        content = arrays.packed(state)
+        write_whole(temporary / "state.safetensors", content)
+        files = {"state.safetensors": {"size": len(content), "sha256": _sha256(content)}}
+        segments = [segment._asdict() for segment in self._segments]
+        manifest = {"format": FORMAT, "step": step, "progress": progress, "files": files, "replay": segments}
+        write_whole(temporary / "manifest.json", _signed(manifest))
+        temporary.rename(final)
+        sync_folder(self.folder)
+        self._prune()
+
+    def _prune(self) -> None:
+        """Remove all but the last, and the moments that none of these names."""
+        kept = self._listed()[: self.keep]
+        for path in self._listed()[self.keep :]:
+            shutil.rmtree(path)
+        kept += self.folder.glob("kept-*")
+        named = {segment["file"] for path in kept for segment in _content(path)["replay"]}
+        for path in (self.folder / "replay").iterdir():
+            if path.name not in named:
+                path.unlink()
+
+    # Reading
+
+    def _listed(self) -> list[pathlib.Path]:
+        """The newest first."""
+        return sorted(listed(self.folder.parent), reverse=True)
+
+    def restore(self, like: Any, moments: Any) -> Found:
+        """The newest checkpoint that is as it was written; the next one goes on from it.
+
+        Args:
+            like: a tree of the structure, shapes and types of what was saved.
+            moments: the same of the ring, whose capacity may have changed.
+
+        Raises:
+            UserError: there is none that is good, or it is of another training or version.
+        """
+        passed_over = []
+        for path in self._listed():
+            try:
+                content = self._checked(path)
+            except Damaged as error:
+                passed_over.append(str(error))
+                path.rename(path.with_name(f"damaged-{path.name}"))
+                continue
+            tree = arrays.read(path / "state.safetensors", like)
+            self._segments = [Segment(**segment) for segment in content["replay"]]
+            rings = self._moments(moments, self._segments)
+            return Found(content["step"], content["progress"], tree, rings, passed_over)
+        why = f": {passed_over[0]}" if passed_over else "."
+        raise UserError(f"{self.folder.parent} has no checkpoint to go on from{why}")
+
+    def _checked(self, path: pathlib.Path) -> dict[str, Any]:
+        """The manifest, once every file that it names is as it was written."""
+        content = _content(path)
+        if content.get("format") != FORMAT:
+            raise UserError(
+                f"{path} was written in format {content.get('format')}, and this version of BeliefRL reads {FORMAT}: "
+                "resume with the version that config.json names."
+            )
+        for name, file in content["files"].items():
+            _check(path / name, file["size"], file["sha256"])
+        for segment in content["replay"]:
+            _check(self.folder / "replay" / segment["file"], segment["size"], segment["sha256"])
+        return content
+
+    def _moments(self, like: Any, segments: list[Segment]) -> Any:
+        rings = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), like)
+        for segment in segments:
+            saved = arrays.load(self.folder / "replay" / segment.file)
+            for where, ring in jax.tree_util.tree_leaves_with_path(rings):
+                for seed, (start, stop) in enumerate(zip(segment.start, segment.stop, strict=True)):
+                    moments = saved[jax.tree_util.keystr(where)][seed, : stop - start]
+                    ring[seed, np.arange(start, stop) % ring.shape[1]] = moments
+        return rings
+
+
+def listed(folder: pathlib.Path) -> list[pathlib.Path]:
+    """The checkpoints in a run's folder, good or not."""
+    return sorted((folder / "checkpoints").glob(f"{NUMBER}-step-*"))
+
+
+def was_ever_written(folder: pathlib.Path) -> bool:
+    """Whether a run's folder has or had a checkpoint, good or not; what a kill left of a first one does not count."""
+    inside = (path.name for path in (folder / "checkpoints").glob("*"))
+    return any(name != "replay" and not name.startswith(".") for name in inside)
+
+
+def _next_number(folder: pathlib.Path) -> int:
+    """One more than any number of a file here, so that none is ever replaced."""
+    found = (re.search(r"\d{6}", path.name) for path in folder.iterdir())
+    return max((int(number[0]) for number in found if number), default=0) + 1
+
+
+def _on_host(leaf: Any) -> Any:
+    """On a CPU JAX's own memory, which need not be copied; elsewhere what is wanted is taken out there."""
+    return np.asarray(leaf) if jax.default_backend() == "cpu" else leaf
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def _canonical(content: dict[str, Any]) -> bytes:
+    return json.dumps(content, sort_keys=True).encode()
+
+
+def _signed(content: dict[str, Any]) -> bytes:
+    return json.dumps({"content": content, "sha256": _sha256(_canonical(content))}, indent=1).encode()
+
+
+def _content(path: pathlib.Path) -> dict[str, Any]:
+    """What the manifest of a checkpoint says."""
+    try:
+        signed = json.loads((path / "manifest.json").read_bytes())
+        if _sha256(_canonical(signed["content"])) == signed["sha256"]:
+            return signed["content"]
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+    raise Damaged(f"{path / 'manifest.json'} is damaged.")
+
+
+def _check(path: pathlib.Path, size: int, sha256: str) -> None:
+    try:
+        content = path.read_bytes()
+    except OSError:
+        content = b""
+    if len(content) != size or _sha256(content) != sha256:
+        raise Damaged(f"{path} is damaged.")

@@ -1,0 +1,107 @@
+"""The folder of a run: made, locked against other processes, and cleared where nothing in it is worth keeping."""
+
+import contextlib
+import json
+import os
+import pathlib
+import re
+import shutil
+from typing import Any
+
+from beliefrl.runs import records
+from beliefrl.runs.arrays import write_whole
+from beliefrl.types import UserError
+
+MAKING = r"metrics|lock|\.config\.json\.tmp"  # what is there before config.json is
+UNSAVED = (  # what a training writes before it has saved an agent or a checkpoint
+    rf"{MAKING}|config\.json|metrics/seed-\d+\.jsonl|\.[\w.]+\.tmp|(tensorboard|wandb)(/.*)?"
+    r"|checkpoints(/replay(/.*)?|/\.[^/]*\.tmp(/.*)?)?"
+)
+
+
+def make(folder: pathlib.Path, config: dict[str, Any]) -> None:
+    """Make the folder of a new run.
+
+    A folder is taken if it is empty, or if a training left it that saved nothing; see `clear`.
+
+    Raises:
+        UserError: it exists and holds something else, or it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        clear(folder)
+        (folder / "metrics").mkdir()
+        write_config(folder, config)
+    except OSError as error:
+        raise UserError(f"The run folder {folder} cannot be made ({error.strerror}): choose another --out.") from None
+
+
+def clear(folder: pathlib.Path) -> None:
+    """Remove what is left of a training that failed or was killed before it saved anything; the folder itself stays.
+
+    Raises:
+        UserError: it holds an agent, a checkpoint or anything that no training wrote; or a process writes it.
+    """
+    inside = [path.relative_to(folder).as_posix() for path in folder.rglob("*")]
+    is_run = _is_of_training(folder)
+    if not all(re.fullmatch(UNSAVED if is_run else MAKING, name) for name in inside):
+        hint = f", or `beliefrl resume {folder}`" if is_run else ""
+        raise UserError(f"{folder} exists already: choose another --out{hint}.")
+    if not inside:
+        return
+    with locked(folder, "is being trained"):
+        for path in folder.iterdir():
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            elif path.name != "lock":
+                path.unlink()
+
+
+def write_config(folder: pathlib.Path, config: dict[str, Any]) -> None:
+    """Write config.json, whole or not at all."""
+    write_whole(folder / "config.json", (json.dumps(config, indent=2, default=str) + "\n").encode())
+
+
+def locked(folder: pathlib.Path, doing: str) -> Any:
+    """An open file that no other process can lock; the system lets go of it when this one ends, however it ends.
+
+    Raises:
+        UserError: the folder cannot be written, or another process is doing something with it.
+    """
+    try:
+        file = (folder / "lock").open("a+")
+    except OSError as error:
+        raise UserError(f"{folder} cannot be written ({error.strerror}): make it writable, or copy it.") from None
+    try:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except ImportError:  # not on this system
+        return file
+    except OSError:
+        file.seek(0)
+        who = file.read().strip() or "another"
+        file.close()
+        raise UserError(f"{folder} {doing} by process {who}: stop it, or wait until it has ended.") from None
+    try:
+        file.truncate(0)
+        file.write(str(os.getpid()))
+        file.flush()
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            file.close()
+        raise UserError(f"{folder} cannot be written ({error.strerror}): make room for it.") from None
+    return file
+
+
+def _is_of_training(folder: pathlib.Path) -> bool:
+    """Whether a training wrote the config.json there."""
+    return records.is_complete(records.parsed(folder / "config.json"))
+
+
+def free_folder(name: str, parent: str = "runs") -> pathlib.Path:
+    """The first of runs/NAME-1, runs/NAME-2, ... that does not exist; what no file is called becomes a dash."""
+    number, name = 1, re.sub(r"[^\w.-]+", "-", name)
+    while (folder := pathlib.Path(parent) / f"{name}-{number}").exists():
+        number += 1
+    return folder

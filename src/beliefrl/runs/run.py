@@ -1,0 +1,254 @@
+"""A run's folder: what a training leaves behind. Knows files, no reinforcement learning.
+
+    config.json           agent, task, options, versions, git commit, command line
+    metrics/seed-0.jsonl  a line for every entry: {"step", "kind": "update" | "episode" | "evaluation", ...}
+    tensorboard/seed-0/   the same as TensorBoard events
+    agent.safetensors     the agents of all seeds at the last evaluation (leading axis: seed); plain arrays, no code
+    results.json          the returns of the last evaluation
+    curve.png             the learning curve
+
+Lines are written out one by one, so a killed training loses at most the line it was writing, which `rows` skips.
+Whatever is read is checked as it is read (`records`), so nobody has to check it again.
+"""
+
+import contextlib
+import dataclasses
+import json
+import os
+import pathlib
+from collections.abc import Collection, Iterator
+from typing import Any
+
+import numpy as np
+
+from beliefrl.runs import arrays, records, trackers
+from beliefrl.runs.arrays import write_whole
+from beliefrl.runs.folder import locked, make, write_config
+from beliefrl.runs.options import Options
+from beliefrl.runs.provenance import now
+from beliefrl.runs.records import Row
+from beliefrl.runs.trackers import Tracker
+from beliefrl.types import UserError, tuples
+
+
+class Run:
+    """A run's folder, to be read."""
+
+    def __init__(self, folder: str | os.PathLike[str]):
+        """Open a folder that a training made.
+
+        Raises:
+            UserError: it does not exist, no training made it, its config.json is damaged, or it is no path.
+        """
+        if not isinstance(folder, str | os.PathLike):
+            raise UserError(f"{folder!r} is not a run: give a run, or the path of its folder.")
+        self.folder = pathlib.Path(folder)
+        if not os.path.isdir(self.folder):  # noqa: PTH112 - pathlib's raises where a name is too long
+            raise UserError(f"There is no run folder {self.folder}: give the --out of a training.")
+        path = self.folder / "config.json"
+        if not path.exists():
+            raise UserError(f"{self.folder} is not a run: it has no config.json; give the --out of a training.")
+        self.config: dict[str, Any] = records.parsed(path)
+        if self.config is None:
+            raise UserError(f"{path} cannot be read as JSON: restore it, or train again.")
+        if not records.is_complete(self.config):
+            raise UserError(f"{path} lacks what a training writes there: restore it, or train again.")
+        try:
+            _ = self.options
+        except UserError as error:
+            raise UserError(f"{path} cannot be used: {error}") from None
+
+    @property
+    def options(self) -> Options:
+        """The options of the training; those that only another version has are left out."""
+        known = {field.name for field in dataclasses.fields(Options)}
+        given = tuples(self.config["options"])
+        return Options(**{name: value for name, value in given.items() if name in known})
+
+    @property
+    def seeds(self) -> list[int]:
+        """The numbers of the run's seeds."""
+        first, count = self.config["options"]["seed"], self.config["options"]["seeds"]
+        return list(range(first, first + count))
+
+    @property
+    def precision(self) -> str:
+        """That of matrix products in training, for `jax.default_matmul_precision`; float32 where none was recorded."""
+        return self.options.precision
+
+    def rows(self, seed: int, kind: str | None = None) -> Iterator[Row]:
+        """The log of a seed in the order it was written; of one kind, if given. Damaged lines are left out.
+
+        Raises:
+            UserError: the log cannot be read.
+        """
+        rows = (row for _, row in records.lines(self._metrics(seed)))
+        return (row for row in rows if row is not None and kind in (None, row["kind"]))
+
+    def damage(self) -> list[str]:
+        """What is wrong with the logs: a sentence for each that has damaged lines, and one if some are missing."""
+        found = [records.damage(self._metrics(seed)) for seed in self.seeds]
+        missing = [seed for seed in self.seeds if not self._metrics(seed).exists()]
+        if missing:
+            logs = f"the log of seed {missing[0]}" if len(missing) == 1 else f"the logs of {len(missing)} seeds"
+            found.append(f"{self.folder / 'metrics'} lacks {logs}: what has no log counts as not begun.")
+        return [sentence for sentence in found if sentence is not None]
+
+    def last_rows(self, seed: int) -> list[Row]:
+        """The last entries of a seed's log, of a run that may be going on.
+
+        Raises:
+            UserError: the log cannot be read.
+        """
+        return records.last_rows(self._metrics(seed))
+
+    def _metrics(self, seed: int) -> pathlib.Path:
+        return self.folder / "metrics" / f"seed-{seed}.jsonl"
+
+    def results(self) -> Row | None:
+        """The summary of the last evaluation; None before there was one.
+
+        Raises:
+            UserError: it is not what a training writes.
+        """
+        path = self.folder / "results.json"
+        if not path.exists():
+            return None
+        results = records.parsed(path)
+        if not records.is_summary(results, len(self.seeds)):
+            raise UserError(f"{path} is damaged: restore it from a copy, or remove it.")
+        return results
+
+    def load(self, like: Any) -> Any:
+        """The saved agents, in a tree of the structure, shapes and types of `like`.
+
+        Raises:
+            UserError: nothing was saved yet, or what was saved is damaged or of another shape.
+        """
+        path = self.folder / "agent.safetensors"
+        if not path.exists():
+            raise UserError(f"{self.folder} has no trained agent yet: it is saved at the first evaluation.")
+        return arrays.read(path, like)
+
+
+class Recorder(Run):
+    """A run's folder, to be written by this process alone."""
+
+    def __init__(self, folder: str | os.PathLike[str], config: dict[str, Any] | None):
+        """Make the folder; without a config, go on with one that exists.
+
+        Raises:
+            UserError: it exists already, or cannot be made; or does not exist, or another process writes it; or a
+                tracker cannot be opened.
+        """
+        folder = pathlib.Path(folder)
+        if config is not None:
+            make(folder, config)
+        super().__init__(folder)
+        self._lock = locked(folder, "is being trained")
+        self._lines: dict[int, Any] = {}
+        self._trackers: dict[int, list[Tracker]] = {}
+        if config is not None:
+            with contextlib.ExitStack() as stack:
+                stack.push(self)
+                self._open()
+                stack.pop_all()
+
+    def __enter__(self) -> "Recorder":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        try:
+            self.close()
+        except Exception:
+            if kind is None:  # else the first error is the one to tell
+                raise
+
+    def _open(self) -> None:
+        track = self.config["options"].get("track", ("tensorboard",))
+        for seed in self.seeds:
+            path = self._metrics(seed)
+            try:
+                self._lines[seed] = path.open("a", buffering=1)
+            except OSError as error:
+                raise UserError(f"{path} cannot be written ({error.strerror}): mend that, then try again.") from None
+            self._trackers[seed] = trackers.open_all(track, self.folder, seed, self.config)
+
+    def note_end(self) -> None:
+        """Write down when this process has ended with the run, if the disk has room for it."""
+        session = self.config["resumed"][-1] if self.config.get("resumed") else self.config
+        session["ended"] = now()
+        with contextlib.suppress(OSError):
+            write_config(self.folder, self.config)
+
+    def amend(self, changes: dict[str, Any], session: dict[str, Any]) -> None:
+        """Change the config, and add what goes on with the run to its `resumed`."""
+        self.config |= changes
+        self.config["resumed"] = [*self.config.get("resumed", ()), session]
+        write_config(self.folder, self.config)
+
+    def lengths(self) -> dict[int, int]:
+        """Bytes in the log of each seed, which are on the disk then."""
+        for lines in self._lines.values():
+            lines.flush()
+            os.fsync(lines.fileno())
+        return {seed: self._metrics(seed).stat().st_size for seed in self.seeds}
+
+    def rewind(self, lengths: dict[int, int]) -> None:
+        """Cut the log of each seed back to so many bytes, and go on from there; 0 begins it again.
+
+        Raises:
+            UserError: a log is shorter.
+        """
+        for seed, length in lengths.items():
+            path = self._metrics(seed)
+            size = path.stat().st_size if path.exists() else 0
+            if size < length:
+                raise UserError(f"{path} is shorter than when the checkpoint was written: restore it from a copy.")
+            if size > length:
+                os.truncate(path, length)
+        self._open()
+        for seed in self.seeds:
+            whole = [tracker for tracker in self._trackers[seed] if tracker.is_whole]
+            for row in self.rows(seed) if whole else ():
+                _tell(whole, row["kind"], row["step"], row)
+
+    def log(self, seed: int, kind: str, step: int, values: Row) -> None:
+        """Write one entry of a seed; numbers go to its trackers as well, of lists their mean."""
+        self._lines[seed].write(json.dumps({"step": step, "kind": kind, **values}) + "\n")
+        _tell(self._trackers[seed], kind, step, values)
+
+    def flush(self) -> None:
+        """Bring everything logged so far onto the disk."""
+        for of_seed in self._trackers.values():
+            for tracker in of_seed:
+                tracker.flush()
+
+    def save(self, agents: Any, but: Collection[int] = ()) -> None:
+        """Save the agents of all seeds but some, of which what was saved before stays; whole or not at all."""
+        path, saved = self.folder / "agent.safetensors", arrays.copied(agents)
+        before = arrays.load(path) if but and path.exists() else {}
+        for name, kept in before.items():
+            saved[name][sorted(but)] = kept[sorted(but)]
+        write_whole(path, arrays.packed(saved))
+
+    def finish(self, results: Row) -> None:
+        """Write the summary of the last evaluation."""
+        write_whole(self.folder / "results.json", (json.dumps(results, indent=2) + "\n").encode())
+
+    def close(self) -> None:
+        """Close the logs, and let others write the folder. All are closed, even if closing one of them fails."""
+        with contextlib.ExitStack() as stack:
+            stack.callback(self._lock.close)
+            for writer in (*self._lines.values(), *(each for of_seed in self._trackers.values() for each in of_seed)):
+                stack.callback(writer.close)
+
+
+def _tell(told: list[Tracker], kind: str, step: int, values: Row) -> None:
+    numbers = {
+        f"{kind}/{name}": float(np.mean(value))
+        for name, value in values.items()
+        if name not in ("step", "kind") and isinstance(value, int | float | list)
+    }
+    for tracker in told:
+        tracker.log(step, numbers)

@@ -1,0 +1,153 @@
+"""What a trained agent is worth: returns over episodes and seeds, with sampled and with mode actions."""
+
+import contextlib
+import os
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array, Key
+
+from beliefrl import agents, tasks
+from beliefrl.agents import Agent
+from beliefrl.runs.options import MOST_EPISODES
+from beliefrl.runs.run import Run
+from beliefrl.tasks import Task
+from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.training.host_evaluation import Evaluation
+from beliefrl.training.phases import evaluate as evaluate_seed
+from beliefrl.training.rollout import Episode
+from beliefrl.types import LARGEST, UserError, tuples
+
+MODES = ("sampled", "mode")  # how actions are chosen; the first axis of an evaluation's leaves behind seeds
+
+
+def summary(result: Episode, has_success: bool) -> dict[str, Any]:
+    """Per mode: every seed's mean return, their mean, its standard error over seeds (None with one), and success.
+
+    Leaves of `result` are (seed, mode, episodes).
+    """
+    total, success = np.asarray(result.total), np.asarray(result.success)
+    table = {}
+    for index, mode in enumerate(MODES):
+        seeds = total[:, index].mean(axis=-1)
+        there = seeds[np.isfinite(seeds)]  # a seed that has diverged has no returns
+        table[mode] = {
+            "mean": float(there.mean()),
+            "sem": float(there.std(ddof=1) / np.sqrt(there.size)) if there.size > 1 else None,
+            "seeds": [float(mean) if np.isfinite(mean) else None for mean in seeds],
+            "success": float(success[:, index].mean()) if has_success else None,
+            "seeds_success": [float(rate) for rate in success[:, index].mean(axis=-1)] if has_success else None,
+        }
+    return table
+
+
+def restore(run: Run, task: Task | GymnasiumTask | None = None) -> tuple[Agent, Any, Any, str]:
+    """The agent, the task, the trained states (leading axis: seed) and the precision (`Run.precision`) of a run.
+
+    `task` is needed only where the run was trained on a task of your own.
+
+    Raises:
+        UserError: the run's agent or task is unknown here, or nothing was saved.
+    """
+    agent = agent_of(run)
+    found = task_of(run) if task is None else task
+    spec = found.spec
+    keys = jax.random.split(jax.random.key(0), len(run.seeds))
+    like = jax.eval_shape(jax.vmap(lambda key: agent.init(key, spec)), keys)
+    return agent, found, run.load(like), run.precision
+
+
+def restore_seed(
+    run: Run | str | os.PathLike[str], seed: int | None = None, task: Task | GymnasiumTask | None = None
+) -> tuple[Agent, Any, Any, str]:
+    """The same of one seed of a run, its first if `seed` is None; see `restore`.
+
+    Raises:
+        UserError: there is no such run, nothing was saved in it, or it has no such seed.
+    """
+    run = run if isinstance(run, Run) else Run(run)
+    seed = run.seeds[0] if seed is None else seed
+    if seed not in run.seeds:
+        raise UserError(f"{run.folder} has no seed {seed}: it has {', '.join(map(str, run.seeds))}.")
+    agent, found, states, precision = restore(run, task)
+    return agent, found, jax.tree.map(lambda leaf: leaf[run.seeds.index(seed)], states), precision
+
+
+def agent_of(run: Run) -> Agent:
+    """The agent of a run, before it was trained.
+
+    Raises:
+        UserError: it is unknown here, or one of its settings is unknown or impossible.
+    """
+    with _naming(run):
+        return agents.make(run.config["agent"], **tuples(run.config["hyperparameters"]))
+
+
+def task_of(run: Run | str | os.PathLike[str]) -> Any:
+    """The task that a run was trained on, as `make_task` makes it; a `gym:PACKAGE:ID` imports its package.
+
+    Raises:
+        UserError: there is no such run, one of its constants is impossible, or it was trained on a task of your own,
+            which cannot be found by a name.
+    """
+    run = run if isinstance(run, Run) else Run(run)
+    name, constants = run.config["task"], tuples(run.config["constants"])
+    if not tasks.knows(name):
+        raise UserError(f"{run.folder} was trained on {name}, which is not a task of this library: pass task=.")
+    with _naming(run):
+        return tasks.make(name, **constants | {"observe": run.config.get("observe")})
+
+
+@contextlib.contextmanager
+def _naming(run: Run) -> Iterator[None]:
+    """A UserError about what the run's config.json says names that file."""
+    try:
+        yield
+    except UserError as error:
+        raise UserError(f"{run.folder / 'config.json'} cannot be used: {error}") from None
+
+
+def evaluate(
+    run: Run | str | os.PathLike[str], episodes: int = 20, seed: int = 0, task: Task | GymnasiumTask | None = None
+) -> dict[str, Any]:
+    """Let the trained agents of a run play `episodes` new episodes, once with sampled and once with mode actions.
+
+    Args:
+        run: a run, or its folder.
+        episodes: episodes for each seed of the run and each mode.
+        seed: of these episodes: the same seed gives the same numbers.
+        task: needed only where the run was trained on a task of your own.
+
+    Returns:
+        {"episodes", "sampled": {"mean", "sem", "seeds", "success", "seeds_success"}, "mode": the same}. Returns are
+        undiscounted; "sem" is over seeds and None with one; success is a rate in [0, 1], None where a task has none.
+
+    Raises:
+        UserError: there is no such run, nothing was saved in it, or a number is impossible.
+    """
+    if not 1 <= episodes <= MOST_EPISODES:
+        raise UserError(f"episodes={episodes} is impossible: it must be from 1 to {MOST_EPISODES}.")
+    if not 0 <= seed <= LARGEST:
+        raise UserError(f"seed={seed} is impossible: it must be from 0 to {LARGEST}.")
+    run = run if isinstance(run, Run) else Run(run)
+    agent, found, states, precision = restore(run, task)
+    keys = jax.random.split(jax.random.key(seed), len(run.seeds))
+    with jax.default_matmul_precision(precision):
+        if isinstance(found, GymnasiumTask):
+            result = _on_host(agent, found, states, keys, episodes, run.seeds)
+        else:
+            compiled = jax.jit(jax.vmap(lambda state, key: evaluate_seed(agent, found, state, key, episodes)))
+            result = compiled(states, keys)
+    return {"episodes": episodes} | summary(result, found.spec.has_success)
+
+
+def _on_host(
+    agent: Agent, task: GymnasiumTask, states: Any, keys: Key[Array, " seed"], episodes: int, seeds: list[int]
+) -> Episode:
+    evaluation = Evaluation(agent, task, seeds, "never")
+    try:
+        return evaluation.play(states, keys, episodes)
+    finally:
+        evaluation.close()

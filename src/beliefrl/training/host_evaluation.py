@@ -1,0 +1,104 @@
+"""Evaluation where the environments run on the host."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from beliefrl.agents import Agent
+from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.training.lockstep import Lockstep, environment_seeds
+from beliefrl.training.rollout import Episode
+from beliefrl.types import Spec, Step
+
+
+class Evaluation:
+    """Environments for evaluation: two for each seed, one played with sampled and one with mode actions."""
+
+    def __init__(
+        self,
+        agent: Agent,
+        task: GymnasiumTask,
+        seeds: Sequence[int],
+        processes: str,
+        tell: Callable[[str], None] | None = None,
+    ):
+        """They are made at the first evaluation; `processes` and `tell` are as in `Lockstep`."""
+        self.agent, self.task, self.seeds, self.processes, self.tell = agent, task, seeds, processes, tell
+        self.environments: Lockstep | None = None
+        lanes = jax.vmap(partial(_perceive, agent, task.spec), in_axes=(None, 0, 0, 0, 0, None))
+        self._perceive = jax.jit(jax.vmap(lanes, in_axes=(0, 0, 0, 0, None, None)))
+
+    def play(self, states: Any, keys: Key[Array, " seed"], episodes: int) -> Episode:
+        """`episodes` episodes, one after the other; leaves (seed, 2, episodes)."""
+        if self.environments is None:
+            lanes = [f"evaluation of seed {seed}" for seed in self.seeds for _ in range(2)]
+            self.environments = Lockstep(self.task, lanes, self.processes, self.tell)
+        keys = jax.vmap(lambda key: jax.random.split(key, 2))(keys)
+        obs = self.environments.reset(environment_seeds(keys).reshape(-1))
+        lanes = len(obs)
+        action: Any = np.zeros((lanes, self.task.spec.action_dim), np.float32)
+        never: Any = np.zeros(lanes, bool)
+        step = Step(obs, never.astype(np.float32), action, ~never, never)
+        empty = self.agent.reset(self.task.spec)
+        memory = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*keys.shape, *leaf.shape)), empty)
+        record, total, length = _Record(lanes, episodes), np.zeros(lanes), np.zeros(lanes, int)
+        explore, time = np.array([True, False]), 0
+        while not record.full:
+            perceived = jax.tree.map(lambda leaf: leaf.reshape(*keys.shape, *leaf.shape[1:]), step)
+            action, memory = self._perceive(states, memory, perceived, keys, explore, time)
+            action = np.asarray(action).reshape(lanes, -1)
+            obs, reward, terminated, truncated, success = self.environments.step(action)
+            total, length, done, time = total + reward, length + 1, terminated | truncated, time + 1
+            record.add(done, total, length, success)
+            if done.any():
+                obs = self.environments.restart(done)
+                total, length = np.where(done, 0.0, total), np.where(done, 0, length)
+            step = Step(obs, reward * ~done, action * ~done[:, None], done, never)
+        return jax.tree.map(lambda leaf: leaf.reshape(*keys.shape, episodes), record.episodes)
+
+    def close(self) -> None:
+        """Close the environments, if there are any."""
+        if self.environments is not None:
+            self.environments.close()
+
+
+def _perceive(
+    agent: Agent,
+    spec: Spec,
+    state: Any,
+    memory: Any,
+    step: Step,
+    key: Key[Array, ""],
+    explore: Bool[Array, ""],
+    time: Int[Array, ""],
+) -> tuple[Float[Array, " action"], Any]:
+    empty = agent.reset(spec)
+    memory = jax.tree.map(lambda new, old: jnp.where(step.is_first, new, old), empty, memory)
+    return agent.act(state, memory, step, jax.random.fold_in(key, time), explore)
+
+
+class _Record:
+    """The first episodes of every lane."""
+
+    def __init__(self, lanes: int, episodes: int):
+        shape = (lanes, episodes)
+        columns: Any = [np.zeros(shape, kind) for kind in (bool, np.float32, np.int32, bool)]
+        self.episodes = Episode(*columns)
+        self.count = np.zeros(lanes, int)
+
+    @property
+    def full(self) -> bool:
+        """Whether every lane has all its episodes."""
+        return bool(self.episodes.done.all())
+
+    def add(self, done: Any, *values: Any) -> None:
+        """What ended, where `done` and still wanted; values are Episode's other fields, leaves (lane,)."""
+        lanes = np.flatnonzero(done & (self.count < self.episodes.done.shape[1]))
+        for column, value in zip(self.episodes, (done, *values), strict=True):
+            column[lanes, self.count[lanes]] = value[lanes]
+        self.count[lanes] += 1

@@ -1,0 +1,71 @@
+"""What of a training's events is written in the log of each seed."""
+
+from collections.abc import Collection
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
+
+from beliefrl.runs.run import Recorder
+from beliefrl.training.evaluation import MODES, summary
+from beliefrl.training.rollout import Episode
+from beliefrl.training.schedule import Event
+
+
+@jax.jit
+def finite(states: Any) -> Bool[Array, " seed"]:
+    """Whether all numbers of each seed's agent are finite."""
+    checks = [
+        jnp.all(jnp.isfinite(leaf), axis=tuple(range(1, leaf.ndim)))
+        for leaf in jax.tree.leaves(states)
+        if jnp.issubdtype(leaf.dtype, jnp.floating)
+    ]
+    return jnp.all(jnp.stack(checks), axis=0)
+
+
+def without(evaluation: Episode, lost: Collection[int]) -> Episode:
+    """The same with no numbers of the seeds that are lost."""
+    total: Any = np.array(evaluation.total)
+    total[sorted(lost)] = np.nan
+    return evaluation._replace(total=total)
+
+
+def record(recorder: Recorder, event: Event, has_success: bool, lost: Collection[int]) -> dict[str, Any] | None:
+    """Log what an event tells of every seed that is not lost; returns the summary of an evaluation."""
+    metrics = {name: np.asarray(values) for name, values in event.metrics.items()}
+    for index, seed in enumerate(recorder.seeds):
+        if index in lost:
+            continue
+        if metrics and event.part:
+            recorder.log(seed, "pretrain", event.part[0], {k: float(v[index]) for k, v in metrics.items()})
+        elif metrics:
+            recorder.log(seed, "update", event.step, {k: float(v[index]) for k, v in metrics.items()})
+        if event.episodes is not None:
+            episodes = jax.tree.map(lambda leaf, index=index: np.asarray(leaf[index]), event.episodes)
+            for end in np.flatnonzero(episodes.done):
+                recorder.log(seed, "episode", event.step, _episode(episodes, end, has_success))
+        if event.evaluation is not None:
+            result = jax.tree.map(lambda leaf, index=index: np.asarray(leaf[index]), event.evaluation)
+            recorder.log(seed, "evaluation", event.step, _evaluated(result, has_success))
+    if event.states is not None:
+        recorder.flush()
+        recorder.save(event.states, lost)
+    if event.evaluation is None:
+        return None
+    return {"step": event.step} | summary(event.evaluation, has_success)
+
+
+def _episode(episodes: Episode, end: Any, has_success: bool) -> dict[str, Any]:
+    success = {"success": bool(episodes.success[end])} if has_success else {}
+    return {"return": float(episodes.total[end]), "length": int(episodes.length[end])} | success
+
+
+def _evaluated(result: Episode, has_success: bool) -> dict[str, Any]:
+    values: dict[str, Any] = {}
+    for index, mode in enumerate(MODES):
+        values[mode] = [float(total) for total in result.total[index]]
+        if has_success:
+            values[f"{mode}_success"] = [bool(success) for success in result.success[index]]
+    return values

@@ -1,0 +1,213 @@
+"""Algorithm 1 of the paper: explore, pre-train, then learn in cycles; compiled, and for many seeds in one program.
+
+    explore    step_start_rl environment steps with the untrained policy
+    pretrain   updates on what they recorded; then the actor and the replay perceive it again
+    learn      cycles: act and record for the steps of one; then draw from the replay for it, and make its updates
+
+The step counter stays outside what is mapped over seeds, and each phase is a compiled function of its own, called
+for a stretch of steps whose number is an argument: one compilation serves all stretches, and no result depends on
+how the training is cut into them. Random keys are derived from the seed's key and the running number of the step.
+`train` decides what is called when.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from beliefrl.agents import Agent
+from beliefrl.tasks import Task
+from beliefrl.training import replay as ring
+from beliefrl.training import rollout
+from beliefrl.training.replay import Replay
+from beliefrl.training.rollout import Actor, Episode
+from beliefrl.types import Spec
+
+Metrics = dict[str, Float[Array, "..."]]
+
+
+def stretch_length(agent: Agent) -> int:
+    """Environment steps between two entries of the log, at most: whole cycles, about 100 steps."""
+    return max(100 // agent.cycle, 1) * agent.cycle
+
+
+class Seed(NamedTuple):
+    """All of one training. Mapped over seeds, every leaf has a leading axis `seed`."""
+
+    state: Any  # the agent's
+    actor: Actor
+    replay: Replay
+    key: Key[Array, ""]
+
+
+class Stretch(NamedTuple):
+    """What a stretch of steps tells, of one seed."""
+
+    metrics: Metrics  # means over its updates
+    episodes: Episode | None  # leaves (stretch,): one entry a step, done only where an episode ended
+
+
+def begin(agent: Agent, task: Task, capacity: int, key: Key[Array, ""]) -> Seed:
+    """A seed before its first step; `capacity` moments fit its replay."""
+    key_state, key_actor, key = jax.random.split(key, 3)
+    return seed_of(agent, task.spec, capacity, rollout.begin(agent, task, key_actor), key_state, key)
+
+
+def seed_of(
+    agent: Agent, spec: Spec, capacity: int, actor: Actor, key_state: Key[Array, ""], key: Key[Array, ""]
+) -> Seed:
+    """A new agent and an empty replay for an actor at its first moment."""
+    return Seed(agent.init(key_state, spec), actor, ring.init(rollout.moment(agent, actor), capacity), key)
+
+
+def _no_episodes(agent: Agent) -> Episode:
+    length = stretch_length(agent)
+    none = jnp.zeros(length, bool)
+    return Episode(none, jnp.zeros(length), jnp.zeros(length, int), none)
+
+
+def _write(log: Episode, index: Int[Array, ""], episode: Episode) -> Episode:
+    return jax.tree.map(lambda column, entry: column.at[index].set(entry), log, episode)
+
+
+def step_key(key: Key[Array, ""], step: Int[Array, ""], purpose: int) -> Key[Array, ""]:
+    return jax.random.fold_in(jax.random.fold_in(key, purpose), step)
+
+
+ACT, UPDATE, SAMPLE, CYCLE, PRETRAIN, RELIVE, EVALUATE, REVIVE = range(8)  # purposes of keys: no two share one
+
+
+def explore(agent: Agent, task: Task, seed: Seed, first: Int[Array, ""], steps: Int[Array, ""]) -> tuple[Seed, Stretch]:
+    """Environment steps `first` to `first + steps` without updates; at most `stretch_length` of them."""
+
+    def step(i, carry):
+        seed, log = carry
+        key = step_key(seed.key, first + i, ACT)
+        actor, replay, episode = rollout.advance(agent, task, seed.state, seed.actor, seed.replay, key)
+        return seed._replace(actor=actor, replay=replay), _write(log, i, episode)
+
+    seed, log = jax.lax.fori_loop(0, steps, step, (seed, _no_episodes(agent)))
+    return seed, Stretch({}, log)
+
+
+def _sum_metrics(shapes: Any) -> Metrics:
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
+
+def pretrain(agent: Agent, seed: Seed, first: Int[Array, ""], updates: Int[Array, ""]) -> tuple[Seed, Metrics]:
+    """Updates `first` to `first + updates` of the pre-training; metrics are their means."""
+
+    def update(seed: Seed, number: Int[Array, ""]) -> tuple[Seed, Metrics]:
+        key_sample, key = jax.random.split(step_key(seed.key, number, PRETRAIN))
+        windows = ring.sample(seed.replay, key_sample, agent.pretrain_windows, agent.window)
+        state, metrics = agent.pretrain(seed.state, windows, key)
+        return seed._replace(state=state), metrics
+
+    def step(i, carry):
+        seed, totals = carry
+        seed, metrics = update(seed, first + i)
+        return seed, jax.tree.map(jnp.add, totals, metrics)
+
+    totals = _sum_metrics(jax.eval_shape(update, seed, first)[1])
+    seed, totals = jax.lax.fori_loop(0, updates, step, (seed, totals))
+    return seed, jax.tree.map(lambda total: total / jnp.maximum(updates, 1), totals)
+
+
+def relive(agent: Agent, spec: Spec, seed: Seed) -> Seed:
+    """Perceive again, with the pre-trained networks, everything recorded so far (at most 2 moments a step)."""
+    length = min(2 * agent.step_start_rl, ring.capacity(seed.replay))
+    key = jax.random.fold_in(seed.key, RELIVE)
+    actor, replay = rollout.relive(agent, spec, seed.state, seed.actor, seed.replay, key, length)
+    return seed._replace(actor=actor, replay=replay)
+
+
+def learn(agent: Agent, task: Task, seed: Seed, first: Int[Array, ""], cycles: Int[Array, ""]) -> tuple[Seed, Stretch]:
+    """`cycles` cycles of learning from environment step `first` on; at most `stretch_length` steps in all."""
+    shapes = jax.eval_shape(partial(_cycle, agent, task), seed, _no_episodes(agent), first, first)[2]
+
+    def step(i, carry):
+        seed, log, totals = carry
+        seed, log, metrics = _cycle(agent, task, seed, log, first + i * agent.cycle, i * agent.cycle)
+        return seed, log, jax.tree.map(jnp.add, totals, metrics)
+
+    seed, log, totals = jax.lax.fori_loop(0, cycles, step, (seed, _no_episodes(agent), _sum_metrics(shapes)))
+    return seed, Stretch(jax.tree.map(lambda total: total / jnp.maximum(cycles, 1), totals), log)
+
+
+def _cycle(
+    agent: Agent, task: Task, seed: Seed, log: Episode, first: Int[Array, ""], index: Int[Array, ""]
+) -> tuple[Seed, Episode, Metrics]:
+    """One cycle, from environment step `first` on, whose entries in the log begin at `index`.
+
+    Its moments are added before any are drawn, and in a loop whose length XLA does not know (it would inline one of a
+    single step): in either other form XLA copies the whole ring.
+    """
+
+    def act(step, carry):
+        seed, log = carry
+        key = step_key(seed.key, step, ACT)
+        actor, replay, episode = rollout.advance(agent, task, seed.state, seed.actor, seed.replay, key)
+        return seed._replace(actor=actor, replay=replay), _write(log, index + step - first, episode)
+
+    seed, log = jax.lax.fori_loop(first, first + agent.cycle, act, (seed, log))
+    state, metrics = learn_cycle(agent, seed, first)
+    return seed._replace(state=state), log, metrics
+
+
+def learn_cycle(agent: Agent, seed: Seed, first: Int[Array, ""]) -> tuple[Any, Metrics]:
+    """What is learned when the steps of the cycle that began at environment step `first` are done: the new state."""
+    windows = ring.sample(seed.replay, step_key(seed.key, first, SAMPLE), agent.cycle_windows, agent.window)
+    state, batches, model_metrics = agent.begin_cycle(seed.state, windows, step_key(seed.key, first, CYCLE))
+
+    count = len(jax.tree.leaves(batches)[0])
+    begun = first * -(-count // agent.cycle)  # no two updates share a key
+
+    def update(state, inputs):
+        number, batch = inputs
+        return agent.update(state, batch, step_key(seed.key, begun + number, UPDATE))
+
+    updates = jnp.arange(count)
+    state, metrics = jax.lax.scan(update, state, (updates, batches))
+    return state, model_metrics | jax.tree.map(jnp.mean, metrics)
+
+
+def evaluate(agent: Agent, task: Task, state: Any, key: Key[Array, ""], episodes: int) -> Episode:
+    """Episodes with sampled actions, then as many with mode actions; leaves (2, episodes)."""
+    sampled: Bool[Array, " 2*episodes"] = jnp.arange(2 * episodes) < episodes
+    result = rollout.evaluate(agent, task, state, key, sampled)
+    return jax.tree.map(lambda leaf: leaf.reshape(2, episodes), result)
+
+
+class Program(NamedTuple):
+    """The phases of training, compiled for many seeds: leaves of every Seed have a leading axis `seed`."""
+
+    begin: Callable[..., Seed]  # keys (seed,)
+    explore: Callable[..., tuple[Seed, Stretch]]  # seeds, first, steps
+    pretrain: Callable[..., tuple[Seed, Metrics]]  # seeds, first, updates
+    relive: Callable[..., Seed]  # seeds
+    learn: Callable[..., tuple[Seed, Stretch]]  # seeds, first, cycles
+    evaluate: Callable[..., Episode]  # states (seed, ...), keys (seed,); leaves (seed, 2, episodes)
+    shapes: Callable[..., Seed]  # keys (seed,); what `begin` gives, without its numbers
+    revive: Callable[..., Seed] = lambda seeds, step: seeds  # after they were read from a checkpoint
+    close: Callable[[], None] = lambda: None  # when no phase will be called any more
+
+
+def compile_program(agent: Agent, task: Task, capacity: int, episodes: int) -> Program:
+    """The phases as compiled functions. Seeds given to one are used up: their memory is taken over."""
+
+    def mapped(function: Callable[..., Any], numbers: int) -> Callable[..., Any]:
+        return jax.jit(jax.vmap(function, in_axes=(0, *[None] * numbers)), donate_argnums=0)
+
+    start = jax.jit(jax.vmap(partial(begin, agent, task, capacity)))
+    return Program(
+        begin=start,
+        explore=mapped(partial(explore, agent, task), 2),
+        pretrain=mapped(partial(pretrain, agent), 2),
+        relive=mapped(partial(relive, agent, task.spec), 0),
+        learn=mapped(partial(learn, agent, task), 2),
+        evaluate=jax.jit(jax.vmap(partial(evaluate, agent, task, episodes=episodes))),
+        shapes=partial(jax.eval_shape, start),
+    )

@@ -1,0 +1,185 @@
+"""An agent in its task: act, step, time limit, reset, record; and evaluation. Only this file knows episodes.
+
+What happens in one environment step, at moment t of an episode:
+
+    the agent perceives moment t and acts        -> a_t, memory
+    the replay keeps moment t and the agent's note
+    the task steps                               -> moment t+1
+    if it is terminal or the time limit is reached, the replay keeps moment t+1 as well and a new episode begins
+
+So every step of the loop is one step of the environment, and the moment in hand is never in the replay yet.
+All functions are for one seed; `train` maps them over seeds.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from beliefrl.agents import Agent
+from beliefrl.tasks import Task
+from beliefrl.training import replay as ring
+from beliefrl.training.replay import Replay
+from beliefrl.types import Moment, Spec, Step
+
+
+class Actor(NamedTuple):
+    """One agent at one moment of one episode."""
+
+    task_state: Any
+    step: Step  # the moment in hand
+    memory: Any  # before that moment is perceived
+    length: Int[Array, ""]  # steps of this episode so far
+    total: Float[Array, ""]  # its rewards so far
+
+
+class Episode(NamedTuple):
+    """What an environment step says of episodes; the other fields count where `done`."""
+
+    done: Bool[Array, "*batch"]
+    total: Float[Array, "*batch"]  # undiscounted return
+    length: Int[Array, "*batch"]
+    success: Bool[Array, "*batch"]
+
+
+def _strong(actor: Actor) -> Actor:
+    """The same without weak types, as Python's numbers in a task leave them: they would make XLA compile twice."""
+
+    def cast(leaf: Array) -> Array:
+        is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        return leaf if is_key else jax.lax.convert_element_type(leaf, leaf.dtype)
+
+    return jax.tree.map(cast, actor)
+
+
+def first(agent: Agent, spec: Spec, task_state: Any, obs: Float[Array, " obs"]) -> Actor:
+    """The first moment of an episode: no reward, no action before it, an empty memory."""
+    step = Step(
+        obs=obs,
+        reward=jnp.array(0.0),
+        prev_action=jnp.zeros(spec.action_dim),
+        is_first=jnp.array(True),
+        terminated=jnp.array(False),
+    )
+    return _strong(Actor(task_state, step, agent.reset(spec), jnp.array(0), jnp.array(0.0)))
+
+
+def begin(agent: Agent, task: Task, key: Key[Array, ""]) -> Actor:
+    """An episode begins."""
+    return first(agent, task.spec, *task.reset(key))
+
+
+def moment(agent: Agent, actor: Actor) -> Moment:
+    """A moment as the replay keeps it; its values are of no account, its shapes are."""
+    return Moment(actor.step, agent.note(actor.memory))
+
+
+def act(
+    agent: Agent, state: Any, actor: Actor, key: Key[Array, ""], explore: Bool[Array, ""]
+) -> tuple[Float[Array, " action"], Any]:
+    """The action at the moment in hand, and the memory that has perceived it; `key` is that of `move`."""
+    key_act, _ = jax.random.split(key)
+    return agent.act(state, actor.memory, actor.step, key_act, explore)
+
+
+def arrive(
+    actor: Actor,
+    memory: Any,
+    action: Float[Array, " action"],
+    task_state: Any,
+    obs: Float[Array, " obs"],
+    reward: Float[Array, ""],
+    terminated: Bool[Array, ""],
+) -> Actor:
+    """The next moment, terminal or not; its memory is of the one before."""
+    step = Step(obs, reward, action, jnp.array(False), terminated)
+    return _strong(Actor(task_state, step, memory, actor.length + 1, actor.total + reward))
+
+
+def move(
+    agent: Agent, task: Task, state: Any, actor: Actor, key: Key[Array, ""], explore: Bool[Array, ""]
+) -> tuple[Actor, Episode]:
+    """Act and step; returns the actor at the next moment."""
+    action, memory = act(agent, state, actor, key, explore)
+    _, key_task = jax.random.split(key)
+    task_state, obs, reward, terminated = task.step(actor.task_state, action, key_task)
+    after = arrive(actor, memory, action, task_state, obs, reward, terminated)
+    done = terminated | (after.length >= task.spec.max_steps)
+    return after, Episode(done, after.total, after.length, task.success(task_state))
+
+
+def record(
+    agent: Agent,
+    state: Any,
+    replay: Replay,
+    actor: Actor,
+    after: Actor,
+    fresh: Actor,
+    done: Bool[Array, ""],
+    key: Key[Array, ""],
+) -> tuple[Actor, Replay]:
+    """Keep the moment that was in hand, and the one `after` it where it is the last; returns what is in hand now."""
+    replay = ring.add(replay, Moment(actor.step, agent.note(after.memory)))
+    # Only its note is used: where that needs no action, XLA drops the acting.
+    _, last = agent.act(state, after.memory, after.step, key, jnp.array(True))
+    replay = ring.add(replay, Moment(after.step, agent.note(last)), done)
+    return jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, after), replay
+
+
+def advance(
+    agent: Agent, task: Task, state: Any, actor: Actor, replay: Replay, key: Key[Array, ""]
+) -> tuple[Actor, Replay, Episode]:
+    """One environment step of training, recorded."""
+    key_move, key_last, key_reset = jax.random.split(key, 3)
+    after, episode = move(agent, task, state, actor, key_move, jnp.array(True))
+    fresh = begin(agent, task, key_reset)
+    return *record(agent, state, replay, actor, after, fresh, episode.done, key_last), episode
+
+
+def relive(
+    agent: Agent, spec: Spec, state: Any, actor: Actor, replay: Replay, key: Key[Array, ""], length: int
+) -> tuple[Actor, Replay]:
+    """Perceive the first `length` moments of the replay again with networks that have changed since.
+
+    Returns the actor with the memory it would have now, and the replay with new notes.
+    """
+    steps, exists = ring.history(replay, length)
+    empty = agent.reset(spec)
+
+    def perceive(memory, moment):
+        step, exists, key = moment
+        before = jax.tree.map(lambda new, old: jnp.where(step.is_first, new, old), empty, memory)
+        _, after = agent.act(state, before, step, key, jnp.array(True))
+        memory = jax.tree.map(lambda new, old: jnp.where(exists, new, old), after, memory)
+        return memory, agent.note(memory)
+
+    memory, notes = jax.lax.scan(perceive, empty, (steps, exists, jax.random.split(key, length)))
+    memory = jax.tree.map(lambda old, new: jnp.where(actor.step.is_first, old, new), empty, memory)
+    return actor._replace(memory=memory), ring.annotate(replay, notes, length)
+
+
+def evaluate(agent: Agent, task: Task, state: Any, key: Key[Array, ""], explore: Bool[Array, " episodes"]) -> Episode:
+    """Whole episodes side by side, apart from training; leaves (episodes,).
+
+    `explore` tells for each episode whether actions are sampled or the policy's mode.
+    """
+    key_reset, key_steps = jax.random.split(key)
+    episodes = explore.shape[0]
+    actors = jax.vmap(lambda key: begin(agent, task, key))(jax.random.split(key_reset, episodes))
+    none = jnp.zeros(episodes, bool)
+    result = Episode(none, jnp.zeros(episodes), jnp.zeros(episodes, int), none)
+
+    def step(carry):
+        time, actors, result = carry
+        keys = jax.random.split(jax.random.fold_in(key_steps, time), episodes)
+        actors, now = jax.vmap(lambda actor, key, explore: move(agent, task, state, actor, key, explore))(
+            actors, keys, explore
+        )
+        result = jax.tree.map(lambda old, new: jnp.where(result.done, old, new), result, now)
+        return time + 1, actors, result
+
+    def unfinished(carry):
+        return (carry[0] < task.spec.max_steps) & ~jnp.all(carry[2].done)
+
+    return jax.lax.while_loop(unfinished, step, (jnp.array(0), actors, result))[2]

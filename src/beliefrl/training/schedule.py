@@ -1,0 +1,173 @@
+"""Training from the first step to the last, on the host: which phase is called when.
+
+The loop is Python over compiled stretches (`phases`); nothing is called back from inside a compiled function. `stages`
+yields what happens, `train` records it in a run's folder.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from beliefrl.agents import Agent
+from beliefrl.runs.options import Options
+from beliefrl.tasks import Task
+from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
+from beliefrl.training import host_loop, phases
+from beliefrl.training.phases import Metrics, Program, Seed
+from beliefrl.training.rollout import Episode
+from beliefrl.types import UserError
+
+
+class Progress(NamedTuple):
+    """How far a training is; with all its arrays, what is needed to go on."""
+
+    step: int = 0
+    pretrained: int = 0  # updates of the pre-training
+    relived: bool = False  # whether the pre-training is over
+    evaluated: int = 0  # step of the last evaluation
+
+
+class Snapshot(NamedTuple):
+    """A training between two stretches; its arrays are used up when the next one begins."""
+
+    progress: Progress
+    seeds: Seed
+
+
+class Event(NamedTuple):
+    """What has just happened in a training; fields beyond the first three only where they apply."""
+
+    doing: str  # what comes next, in words
+    step: int  # environment steps of each seed so far
+    metrics: Metrics = {}  # leaves (seed,): means over the last stretch
+    episodes: Episode | None = None  # leaves (seed, stretch)
+    evaluation: Episode | None = None  # leaves (seed, mode, episodes)
+    states: Any = None  # the agents, where they are to be saved
+    part: tuple[int, int] | None = None  # of the pre-training: updates done, of how many
+    snapshot: Snapshot | None = None  # where a training can be left, and gone on from
+    note: str | None = None  # something else that the user should know, a sentence
+
+
+def stages(
+    agent: Agent,
+    task: Task | GymnasiumTask,
+    options: Options,
+    restore: Callable[[Seed], Snapshot] | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> Iterator[Event]:
+    """Train; yields an Event before whatever takes long and after whatever gave something to tell.
+
+    Args:
+        agent: what learns.
+        task: on what.
+        options: how long.
+        restore: is given the shapes of a training's arrays, and returns those to go on from.
+        tell: is called by another thread with what cannot wait for the next Event, a sentence.
+
+    Raises:
+        Fault: of a Gymnasium environment, after an Event with what was learned until then.
+    """
+    numbers = range(options.seed, options.seed + options.seeds)
+    sizes = capacity(agent, options), options.eval_episodes
+    if isinstance(task, GymnasiumTask):
+        yield Event("making the environments", 0)
+        program = host_loop.program(agent, task, *sizes, numbers, options.processes, tell)
+    else:
+        program = phases.compile_program(agent, task, *sizes)
+    keys = jax.vmap(jax.random.key)(np.array(numbers))
+    try:
+        if restore is None:
+            yield Event("compiling the agent", 0)
+            start = Snapshot(Progress(), program.begin(keys))
+        else:
+            at, seeds = restore(program.shapes(keys))
+            start = Snapshot(at, program.revive(seeds, at.step))
+        yield from _stages(agent, program, options, *start)
+    except Fault as fault:
+        if fault.seeds is not None:
+            metrics, episodes = fault.told or ({}, None)
+            learned = fault.seeds.state if fault.step >= agent.step_start_rl else None
+            yield Event("stopped by a fault", fault.step, metrics, episodes, states=learned)
+        raise
+    finally:
+        program.close()
+
+
+def _stages(agent: Agent, program: Program, options: Options, at: Progress, seeds: Seed) -> Iterator[Event]:
+    explored = min(agent.step_start_rl, options.steps)
+    stretch = phases.stretch_length(agent)
+
+    if at.step < explored:
+        yield Event("compiling the exploration", at.step)
+        seeds, _ = program.explore(seeds, at.step, 0)
+        yield Event("exploring", at.step)
+    while at.step < explored:
+        steps = min(stretch, explored - at.step, _until(at.step, options.eval_every))
+        seeds, told = program.explore(seeds, at.step, steps)
+        at = at._replace(step=at.step + steps)
+        yield Event("exploring", at.step, episodes=told.episodes)
+        if at.step % options.eval_every == 0:
+            yield from _evaluation(program, seeds, at.step, "exploring")
+            at = at._replace(evaluated=at.step)
+        yield Event("exploring", at.step, snapshot=Snapshot(at, seeds))
+
+    if at.step < options.steps and agent.pretrain_updates and not at.relived:
+        if at.pretrained < agent.pretrain_updates:
+            yield Event("compiling the pre-training", at.step)
+            seeds, _ = program.pretrain(seeds, at.pretrained, 0)
+            yield Event("pre-training", at.step)
+        while at.pretrained < agent.pretrain_updates:
+            updates = min(stretch, agent.pretrain_updates - at.pretrained)
+            seeds, metrics = program.pretrain(seeds, at.pretrained, updates)
+            at = at._replace(pretrained=at.pretrained + updates)
+            told = {f"pretrain_{name}": mean for name, mean in metrics.items()}
+            part = at.pretrained, agent.pretrain_updates
+            yield Event("pre-training", at.step, told, part=part, snapshot=Snapshot(at, seeds))
+        seeds, at = program.relive(seeds), at._replace(relived=True)
+
+    if at.step < options.steps:
+        yield Event("compiling the learning", at.step)
+        seeds, _ = program.learn(seeds, at.step, 0)
+        yield Event("learning", at.step)
+    while at.step < options.steps:
+        until = min(options.steps - at.step, _until(at.step, options.eval_every))
+        cycles = min(-(-until // agent.cycle), stretch // agent.cycle)
+        seeds, told = program.learn(seeds, at.step, cycles)
+        before, at = at.step, at._replace(step=at.step + cycles * agent.cycle)
+        yield Event("learning", at.step, told.metrics, told.episodes)
+        if at.step // options.eval_every > before // options.eval_every:
+            yield from _evaluation(program, seeds, at.step, "learning")
+            at = at._replace(evaluated=at.step)
+        yield Event("learning", at.step, snapshot=Snapshot(at, seeds))
+    if at.evaluated < at.step:
+        yield from _evaluation(program, seeds, at.step, "learning")
+        yield Event("finished", at.step, snapshot=Snapshot(at._replace(evaluated=at.step), seeds))
+
+
+def capacity(agent: Agent, options: Options) -> int:
+    """Moments in a seed's replay: no more than can come, a moment a step and one more where an episode ends."""
+    if options.steps > agent.step_start_rl:
+        needed = max(2 * agent.step_start_rl, agent.window.length + 1)  # `relive` wants all of the exploration
+        if options.replay_capacity < needed:
+            raise UserError(
+                f"replay_capacity={options.replay_capacity} is too small: this agent needs at least {needed}."
+            )
+    return min(options.replay_capacity, 2 * options.steps)
+
+
+def _until(step: int, every: int) -> int:
+    """Steps to the next multiple of `every`."""
+    return every - step % every
+
+
+def _evaluation(program: Program, seeds: Seed, step: int, doing: str) -> Iterator[Event]:
+    yield Event("evaluating", step)
+    keys = jax.vmap(lambda key: jax.random.fold_in(jax.random.fold_in(key, phases.EVALUATE), step))(seeds.key)
+    try:
+        result = program.evaluate(seeds.state, keys)
+    except Fault as fault:
+        fault.seeds, fault.step = seeds, step
+        raise
+    yield Event(doing, step, evaluation=result, states=seeds.state)

@@ -1,0 +1,263 @@
+"""A training and what it leaves: its folder, log and checkpoints; how it is stopped, gone on with, and ended.
+
+`schedule.stages` does the training and yields what happens; everything here listens.
+"""
+
+import contextlib
+import dataclasses
+import os
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from beliefrl import agents, tasks
+from beliefrl.agents import Agent
+from beliefrl.analysis.curves import draw_curve
+from beliefrl.runs import trackers
+from beliefrl.runs.checkpoint import Checkpoints, listed, was_ever_written
+from beliefrl.runs.folder import free_folder
+from beliefrl.runs.provenance import provenance
+from beliefrl.runs.run import Recorder, Run
+from beliefrl.tasks import Task
+from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.training import log
+from beliefrl.training.evaluation import agent_of, task_of, tuples
+from beliefrl.training.phases import Seed
+from beliefrl.training.schedule import Event, Options, Progress, Snapshot, capacity, stages
+from beliefrl.training.stop import Requests, Stopped
+from beliefrl.types import UserError
+
+Report = Callable[[Event], None]
+
+
+def train(
+    agent: Agent | str,
+    task: Task | GymnasiumTask | str,
+    out: str | os.PathLike[str] | None = None,
+    report: Report | None = None,
+    **options: Any,
+) -> Run:
+    """Train an agent on a task and record it in a folder.
+
+    Args:
+        agent: an agent, or the name of one with its default hyperparameters.
+        task: a task, or the name of one.
+        out: the run's folder; None is runs/AGENT-TASK-1, or the next free number. It must not exist, unless it is empty
+            or a training left it that ended before it saved an agent or a checkpoint; then it is used again.
+        report: called with every Event as it happens, for progress. Notes that cannot wait come from another thread.
+        options: the fields of `Options`: steps, seeds, seed, eval_every, eval_episodes, replay_capacity, processes,
+            checkpoint_steps, checkpoint_minutes, keep_checkpoints, precision, track.
+
+    Returns:
+        The finished run: its results, its log, its files (`runs`).
+
+    Raises:
+        UserError: an unknown name or option, an impossible value, `out` exists, a tracker cannot be opened, the disk is
+            full, or a Gymnasium environment did what none may do; then what was learned and logged until that step is
+            saved.
+        Stopped: Ctrl-C or SIGTERM, once a checkpoint is written; `resume` goes on. It is a KeyboardInterrupt.
+    """
+    agent = agents.make(agent) if isinstance(agent, str) else agent
+    made: Any = tasks.make(task) if isinstance(task, str) else task
+    known = [field.name for field in dataclasses.fields(Options)]
+    for name in options:
+        if name not in known:
+            raise UserError(f"Training has no option {name!r}: it has {', '.join(known)}.")
+    chosen = Options(**options)
+    _ = capacity(agent, chosen), made.spec, trackers.check(chosen.track)  # complain before there is a folder
+    config = {
+        "agent": agents.name_of(agent),
+        "hyperparameters": dataclasses.asdict(agent),  # pyright: ignore[reportArgumentType]
+        **tasks.describe(made),
+        "options": dataclasses.asdict(chosen),
+        **provenance(),
+    }
+    recorder = Recorder(out or free_folder(f"{config['agent']}-{config['task']}"), config)
+    return _Training(recorder, agent, made, chosen, report).run()
+
+
+def resume(
+    run: Run | str | os.PathLike[str],
+    steps: int | None = None,
+    task: Task | GymnasiumTask | None = None,
+    report: Report | None = None,
+) -> Run:
+    """Go on with a training from its last checkpoint.
+
+    On one machine and kind of device, metrics and networks are bit-identical to those of an uninterrupted training
+    (measured on CPU, not on a GPU). A Gymnasium environment cannot be saved: a new episode begins there. A training
+    that was stopped before its first checkpoint begins again from step 0.
+
+    Args:
+        run: a run, or its folder.
+        steps: train for so many environment steps in all; None: as many as before. They may only grow.
+        task: needed only where the run was trained on a task of your own.
+        report: as in `train`.
+
+    Raises:
+        UserError: there is no such run, none of its checkpoints is good or left, another process trains it, or `steps`
+            are too few.
+        Stopped: Ctrl-C or SIGTERM, once a checkpoint is written.
+    """
+    run = run if isinstance(run, Run) else Run(run)
+    folder, agent = run.folder, agent_of(run)
+    begins_again = not was_ever_written(folder) and not (folder / "results.json").exists()
+    if not (begins_again or listed(folder)):
+        raise UserError(f"{folder} has no checkpoint to go on from any more: train again, with another --out.")
+    with contextlib.ExitStack() as stack:
+        recorder = stack.enter_context(Recorder(folder, None))
+        made = task_of(recorder) if task is None else task
+        before = _options(recorder)
+        if steps is not None and steps < before["steps"]:
+            raise UserError(f"steps={steps} is impossible: {folder} trains for {before['steps']}, and may only grow.")
+        options = dataclasses.replace(Options(**before), **({} if steps is None else {"steps": steps}))
+        trackers.check(options.track)
+        recorder.amend({"options": dataclasses.asdict(options)}, provenance())
+        training = _Training(recorder, agent, made, options, report)
+        if begins_again:
+            training.begin_again()
+        stack.pop_all()
+    return training.run(None if begins_again else training.restore)
+
+
+def _options(run: Run) -> dict[str, Any]:
+    """With which a run was trained."""
+    known = {field.name for field in dataclasses.fields(Options)}
+    for name in run.config["options"]:
+        if name not in known:
+            raise UserError(f"{run.folder} was trained by another version: this one has no option {name!r}.")
+    return {"steps": Options.steps} | tuples(run.config["options"])
+
+
+class _Training:
+    """One training as it is being recorded."""
+
+    def __init__(self, recorder: Recorder, agent: Agent, task: Any, options: Options, report: Report | None):
+        self.recorder, self.agent, self.task, self.options = recorder, agent, task, options
+        self.report = report or (lambda event: None)
+        self.has_success = task.spec.has_success
+        self.checkpoints = Checkpoints(recorder.folder, options.keep_checkpoints)
+        self.last, self.saved_at = Progress(), time.monotonic()
+        self.results = recorder.results()
+        self.lost: set[int] = set()  # indices of the seeds that have diverged
+        self.step = 0
+        self.requests = Requests(partial(self._note, "stopping after this stretch; Ctrl-C again ends at once"))
+
+    def run(self, restore: Callable[[Seed], Snapshot] | None = None) -> Run:
+        """To the end, or until it is stopped."""
+        try:
+            with self.recorder, jax.default_matmul_precision(self.options.precision):
+                self._train(restore)
+        except BrokenPipeError:  # whoever was reading the reports has gone
+            raise
+        except OSError as error:
+            raise UserError(
+                f"{self.recorder.folder} cannot be written ({error.strerror}): mend that, then "
+                f"`beliefrl resume {self.recorder.folder}` goes on."
+            ) from None
+        return self.recorder
+
+    def _train(self, restore: Callable[[Seed], Snapshot] | None) -> None:
+        try:
+            with self.checkpoints, self.requests:
+                for event in stages(self.agent, self.task, self.options, restore, self._note):
+                    self._listen(event)
+            self.recorder.finish(self.results or {})
+            draw_curve(self.recorder)
+        finally:
+            self.recorder.note_end()
+
+    def begin_again(self) -> None:
+        """Forget what was logged: there is nothing to go on from."""
+        self.recorder.rewind(dict.fromkeys(self.recorder.seeds, 0))
+        self._note("no checkpoint was written: begins again from step 0")
+
+    def restore(self, shapes: Seed) -> Snapshot:
+        """From the last good checkpoint; the log is cut back to what it was then."""
+        ring = shapes.replay
+        like = shapes._replace(replay=ring._replace(moments=()))
+        found = self.checkpoints.restore(like, ring.moments)
+        for why in found.passed_over:
+            self.report(Event("resuming", found.step, note=f"{why} The checkpoint before it is used."))
+        self.recorder.rewind({int(seed): length for seed, length in found.progress["metrics"].items()})
+        self.last, self.lost = Progress(*found.progress["progress"]), set(found.progress["lost"])
+        self.report(Event("resuming", found.step, note=f"goes on from the checkpoint of step {found.step:,}"))
+        if isinstance(self.task, GymnasiumTask):
+            self.report(Event("resuming", found.step, note="a new episode begins: an environment cannot be saved"))
+        seeds = found.tree._replace(replay=found.tree.replay._replace(moments=found.moments))
+        return Snapshot(self.last, jax.tree.map(jnp.asarray, seeds))
+
+    def _listen(self, event: Event) -> None:
+        self.step = event.step
+        self._look_for_divergence(event)
+        if event.evaluation is not None and self.lost:
+            event = event._replace(evaluation=log.without(event.evaluation, self.lost))
+        self.results = log.record(self.recorder, event, self.has_success, self.lost) or self.results
+        self.report(event)
+        if event.snapshot is not None:
+            self._consider(event.snapshot)
+
+    def _note(self, note: str) -> None:
+        """Tell the user something at once, whichever thread it comes from."""
+        self.report(Event("training", self.step, note=note))
+
+    def _look_for_divergence(self, event: Event) -> None:
+        """A seed whose losses or networks are not finite any more is lost; the others go on."""
+        for name, values in event.metrics.items():
+            self._lose(np.flatnonzero(~np.isfinite(values)), event, f"{name} is not finite")
+        states = event.states
+        if event.snapshot is not None and self._is_due(event.snapshot):
+            states = event.snapshot.seeds.state
+        if states is not None:
+            self._lose(np.flatnonzero(~np.asarray(log.finite(states))), event, "its networks are not finite")
+
+    def _lose(self, indices: np.ndarray, event: Event, why: str) -> None:
+        for index in indices:
+            if index in self.lost:
+                continue
+            seed = self.recorder.seeds[index]
+            self.lost.add(int(index))
+            self.recorder.log(seed, "diverged", event.step, {"why": why})
+            kept = self.checkpoints.keep_for(f"seed-{seed}")
+            where = f"its last good checkpoint stays in {kept}" if kept else "it had no checkpoint yet"
+            note = f"seed {seed} diverged by step {event.step:,}: {why}; {where}."
+            if len(self.lost) == len(self.recorder.seeds):
+                raise UserError(f"All seeds have diverged; {note} Try smaller learning rates.")
+            self.report(Event(event.doing, event.step, note=note))
+
+    def _is_due(self, snapshot: Snapshot) -> bool:
+        """Whether it is time for a checkpoint."""
+        progress, options = snapshot.progress, self.options
+        steps = progress.step - self.last.step >= options.checkpoint_steps > 0
+        minutes = time.monotonic() - self.saved_at >= 60 * options.checkpoint_minutes > 0
+        relived = progress.relived and not self.last.relived
+        return bool(steps or minutes or relived or self._has_ended(progress) or self.requests.number)
+
+    def _has_ended(self, progress: Progress) -> bool:
+        return progress.step >= self.options.steps and progress.evaluated == progress.step
+
+    def _consider(self, snapshot: Snapshot) -> None:
+        """Write a checkpoint if it is time for one; leave if that was asked for."""
+        if not self._is_due(snapshot):
+            return
+        progress, asked = snapshot.progress, self.requests.number
+        if progress.relived and not self.last.relived:
+            self.checkpoints.forget_moments()
+        self._save(snapshot)
+        if asked and not self._has_ended(progress):
+            self.checkpoints.wait()
+            folder = self.recorder.folder
+            raise Stopped(f"stopped at step {progress.step:,}; `beliefrl resume {folder}` goes on from there.", asked)
+
+    def _save(self, snapshot: Snapshot) -> None:
+        replay = snapshot.seeds.replay
+        rest = snapshot.seeds._replace(replay=replay._replace(moments=()))
+        lost = sorted(self.lost)
+        progress = {"progress": list(snapshot.progress), "metrics": self.recorder.lengths(), "lost": lost}
+        self.checkpoints.save(snapshot.progress.step, progress, rest, replay.moments, np.asarray(replay.added))
+        self.last, self.saved_at = snapshot.progress, time.monotonic()

@@ -1,0 +1,177 @@
+"""Our networks and losses give the numbers that the authors' code gave (tests/golden, toy sizes, PyTorch's layout)."""
+
+import pathlib
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from beliefrl.models.nets import MLP
+from beliefrl.models.soft_actor_critic import Actor, Batch, Controller, loss, soft_update
+from beliefrl.models.variational_model import VRM, elbo_terms
+
+GOLDEN = pathlib.Path(__file__).parent / "golden"
+D, Z, HIDDEN, X, ACTION = 16, 4, 8, 7, 3
+
+
+def close(ours, theirs):
+    """Equal to 1e-5 of the array's own size."""
+    ours, theirs = np.asarray(ours), np.asarray(theirs)
+    assert ours.shape == theirs.shape
+    np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-5 * max(np.abs(theirs).max(), 1e-3))
+
+
+def net(numbers, name, activation):
+    """The weights `name` of a golden file as an MLP."""
+    count = sum(key.startswith(f"{name}/") and key.endswith("weight") for key in numbers)
+    sizes = [numbers[f"{name}/0/weight"].shape[1]] + [numbers[f"{name}/{i}/weight"].shape[0] for i in range(count)]
+    mlp = MLP(sizes, activation)
+    layers = tuple(
+        eqx.tree_at(
+            lambda layer: (layer.weight, layer.bias),
+            layer,
+            (jnp.array(numbers[f"{name}/{i}/weight"]), jnp.array(numbers[f"{name}/{i}/bias"])),
+        )
+        for i, layer in enumerate(mlp.layers)
+    )
+    return eqx.tree_at(lambda mlp: mlp.layers, mlp, layers)
+
+
+def with_weights(part, group):
+    """All arrays of one group ("w/" or "g/") of a golden file, without the group's name."""
+    return {key.removeprefix(group): value for key, value in part.items() if key.startswith(group)}
+
+
+def vrm_from(numbers):
+    """A VRM whose weights (or whose gradient) are the golden ones; the two LSTM biases become one."""
+    vrm = VRM(X, ACTION, D, Z, HIDDEN)
+    mean, sigma = net(numbers, "posterior_mean", jnp.tanh), net(numbers, "posterior_sigma", jnp.tanh)
+    posterior = np.concatenate([mean.layers[0].weight, sigma.layers[0].weight]).T  # rows d, action, features
+    w_ih, w_hh = numbers["lstm/weight_ih"].T, numbers["lstm/weight_hh"].T  # rows features, z
+    joint = (
+        np.concatenate([posterior[:D], w_hh], axis=1),
+        np.concatenate([posterior[D + ACTION :], w_ih[:HIDDEN]], axis=1),
+        posterior[D : D + ACTION],
+        w_ih[HIDDEN:],
+        np.concatenate([mean.layers[0].bias, sigma.layers[0].bias, numbers["lstm/bias_ih"] + numbers["lstm/bias_hh"]]),
+    )
+    others = ("features", "prior_mean", "prior_sigma", "decoder_mean", "decoder_sigma")
+    return eqx.tree_at(
+        lambda vrm: (
+            vrm.joint.by_d,
+            vrm.joint.by_features,
+            vrm.joint.by_action,
+            vrm.joint.by_z,
+            vrm.joint.bias,
+            vrm.posterior_mean,
+            vrm.posterior_sigma,
+            *(getattr(vrm, name) for name in others),
+        ),
+        vrm,
+        (
+            *map(jnp.array, joint),
+            mean.layers[1],
+            sigma.layers[1],
+            *(net(numbers, name, jnp.tanh) for name in others),
+        ),
+    )
+
+
+@pytest.fixture(scope="module")
+def vrm_numbers():
+    return dict(np.load(GOLDEN / "vrm.npz"))
+
+
+@pytest.fixture(scope="module")
+def inputs(vrm_numbers):
+    """x, prev_action, is_first and noise, time first."""
+    x, action, noise = (jnp.array(vrm_numbers[name].swapaxes(0, 1)) for name in ("x", "prev_action", "noise"))
+    return x, action, jnp.zeros(x.shape[:2], bool), noise
+
+
+def negative_elbo(vrm, inputs):
+    x, action, _, _ = inputs
+    terms = elbo_terms(vrm, vrm.infer(vrm.start(x.shape[1]), *inputs), x, action)
+    return jnp.mean(terms.kl) - jnp.mean(terms.log_likelihood)
+
+
+def test_inference_equals_the_authors(vrm_numbers, inputs):
+    vrm = vrm_from(with_weights(vrm_numbers, "w/"))
+    inferred = vrm.infer(vrm.start(3), *inputs)
+    prior = jax.vmap(jax.vmap(vrm.prior))(inferred.before, inputs[1])
+    decoded = jax.vmap(jax.vmap(vrm.decode))(inferred.before, inferred.z)
+    ours = {
+        "posterior_mean": inferred.posterior.mean,
+        "posterior_sigma": inferred.posterior.sigma,
+        "prior_mean": prior.mean,
+        "prior_sigma": prior.sigma,
+        "z": inferred.z,
+        "d": inferred.state.d,
+        "c": inferred.state.c,
+        "decoded_mean": decoded.mean,
+        "decoded_sigma": decoded.sigma,
+    }
+    for name, value in ours.items():
+        close(value.swapaxes(0, 1), vrm_numbers[name])
+
+
+def test_elbo_equals_the_authors(vrm_numbers, inputs):
+    vrm = vrm_from(with_weights(vrm_numbers, "w/"))
+    terms = elbo_terms(vrm, vrm.infer(vrm.start(3), *inputs), inputs[0], inputs[1])
+    close(terms.kl.T, vrm_numbers["kl"])
+    close(terms.log_likelihood.T, vrm_numbers["log_likelihood"])
+    close(negative_elbo(vrm, inputs), vrm_numbers["negative_elbo"])
+
+
+def test_gradient_of_the_elbo_equals_the_authors(vrm_numbers, inputs):
+    gradient = jax.grad(negative_elbo)(vrm_from(with_weights(vrm_numbers, "w/")), inputs)
+    numbers = with_weights(vrm_numbers, "g/")
+    np.testing.assert_array_equal(numbers["lstm/bias_ih"], numbers["lstm/bias_hh"])
+    theirs = vrm_from(numbers | {"lstm/bias_hh": np.zeros_like(numbers["lstm/bias_hh"])})
+    jax.tree.map(close, gradient, theirs)
+
+
+@pytest.fixture(scope="module")
+def sac_numbers():
+    return dict(np.load(GOLDEN / "sac.npz"))
+
+
+def controller_from(numbers, log_alpha):
+    actor = Actor(39, 3, (8, 8))
+    networks = {name: net(numbers, name, jax.nn.relu) for name in ("mean", "log_sigma", "value", "q1", "q2")}
+    actor = eqx.tree_at(lambda actor: (actor.mean, actor.log_sigma), actor, (networks["mean"], networks["log_sigma"]))
+    target = net(numbers, "target_value", jax.nn.relu) if "target_value/0/weight" in numbers else networks["value"]
+    return Controller(actor, (networks["q1"], networks["q2"]), networks["value"], target, jnp.array(log_alpha))
+
+
+@pytest.fixture(scope="module")
+def update(sac_numbers):
+    controller = controller_from(with_weights(sac_numbers, "w/"), sac_numbers["log_alpha"])
+    batch = Batch(
+        *(jnp.array(sac_numbers[name]) for name in ("belief", "next_belief", "action", "reward")),
+        terminated=jnp.array(sac_numbers["terminated"] > 0),
+        valid=jnp.ones(11, bool),
+    )
+    return controller, jax.grad(loss, has_aux=True)(
+        controller, batch, jnp.array(sac_numbers["noise"]), gamma=float(sac_numbers["gamma"]), regulariser=1e-3
+    )
+
+
+def test_losses_equal_the_authors(sac_numbers, update):
+    metrics = update[1][1]
+    for name in ("loss_value", "loss_q", "loss_actor"):
+        close(metrics[name], sac_numbers[name])
+
+
+def test_gradients_of_the_losses_equal_the_authors(sac_numbers, update):
+    gradient = update[1][0]
+    theirs = controller_from(with_weights(sac_numbers, "g/"), sac_numbers["g/log_alpha"])
+    jax.tree.map(close, gradient._replace(target_value=theirs.value), theirs)
+
+
+def test_target_value_moves_as_the_authors(sac_numbers, update):
+    controller = update[0]
+    after = soft_update(controller.target_value, controller.value, 0.005)
+    jax.tree.map(close, after, net(with_weights(sac_numbers, "after/"), "target_value", jax.nn.relu))

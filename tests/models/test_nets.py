@@ -1,0 +1,107 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from beliefrl.models.nets import (
+    MLP,
+    Scale,
+    draw,
+    gaussian_kl,
+    gaussian_log_prob,
+    lstm_state,
+    observe,
+    standardised,
+    tanh_gaussian,
+    unscaled,
+)
+
+
+def sigmoid(x):
+    return 1 / (1 + np.exp(-x))
+
+
+def test_lstm_state_is_the_textbook_cell():
+    gates, c = jax.random.normal(jax.random.key(0), (5, 12)) * 3, jax.random.normal(jax.random.key(1), (5, 3))
+    i, f, g, o = np.split(np.array(gates, np.float64), 4, axis=-1)
+    c_next = sigmoid(f) * np.array(c) + sigmoid(i) * np.tanh(g)
+    ours = lstm_state(gates, c)
+    np.testing.assert_allclose(ours[1], c_next, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(ours[0], sigmoid(o) * np.tanh(c_next), rtol=1e-5, atol=1e-6)
+
+
+def test_lstm_state_has_the_gradient_of_the_textbook_cell():
+    def textbook(gates, c):
+        i, f, g, o = jnp.split(gates, 4, axis=-1)
+        c = jax.nn.sigmoid(f) * c + jax.nn.sigmoid(i) * jnp.tanh(g)
+        return jax.nn.sigmoid(o) * jnp.tanh(c), c
+
+    def probe(cell):
+        return lambda gates, c: sum(
+            jnp.sum(weight * out) for weight, out in zip((1.3, 0.7), cell(gates, c), strict=True)
+        )
+
+    gates, c = jax.random.normal(jax.random.key(0), (2, 12)), jax.random.normal(jax.random.key(1), (2, 3))
+    ours, theirs = (jax.jit(jax.grad(probe(cell), (0, 1)))(gates, c) for cell in (lstm_state, textbook))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), ours, theirs)
+
+
+def test_kl_is_the_mean_log_ratio_of_samples():
+    p, q = (0.3, 0.7), (-0.4, 1.1)
+    x = q[0] + q[1] * jax.random.normal(jax.random.key(0), (400_000,))
+    ratio = gaussian_log_prob(x, *(jnp.full_like(x, v) for v in q)) - gaussian_log_prob(
+        x, *(jnp.full_like(x, v) for v in p)
+    )
+    kl = gaussian_kl(*(jnp.array(v) for v in (*q, *p)))
+    assert float(kl) == pytest.approx(float(ratio.mean()), abs=0.01)
+    assert float(gaussian_kl(*(jnp.array(v) for v in (*q, *q)))) == pytest.approx(0, abs=1e-6)
+
+
+def test_density_of_squashed_actions_integrates_to_one():
+    mean, log_sigma = jnp.array([0.4]), jnp.array([-0.5])
+    noise = jnp.linspace(-6, 6, 20_001)[:, None]
+    action, log_prob = jax.vmap(lambda n: tanh_gaussian(mean, log_sigma, n))(noise)
+    assert float(np.trapezoid(np.exp(log_prob), action[:, 0])) == pytest.approx(1, abs=1e-3)
+
+
+def test_log_prob_stays_finite_where_tanh_saturates():
+    action, log_prob = tanh_gaussian(jnp.array([40.0, -40.0]), jnp.array([2.0, 2.0]), jnp.array([3.0, -3.0]))
+    np.testing.assert_array_equal(action, [1.0, -1.0])
+    assert np.isfinite(log_prob)
+
+
+def test_layers_start_in_pytorchs_bounds():
+    mlp = draw(jax.random.key(0), MLP((50, 400, 3), jnp.tanh))
+    for layer, fan_in in zip(mlp.layers, (50, 400), strict=True):
+        for leaf in (layer.weight, layer.bias):
+            assert float(jnp.abs(leaf).max()) <= fan_in**-0.5
+        assert float(jnp.std(layer.weight)) == pytest.approx(fan_in**-0.5 / 3**0.5, rel=0.05)
+
+
+def test_rest_continues_from_the_first_layer():
+    mlp, x = draw(jax.random.key(0), MLP((3, 8, 8, 2), jnp.tanh)), jnp.arange(3.0)
+    np.testing.assert_array_equal(mlp(x), mlp.rest(mlp.layers[0](x)))
+
+
+def test_a_scale_has_the_moments_of_all_valid_vectors_and_makes_them_standard():
+    x = 3.0 + jax.random.normal(jax.random.key(0), (4, 6, 5, 2)) * jnp.array([0.01, 2.0])[None, None, None]
+    valid = jnp.ones((6, 5), bool).at[2, 1:].set(False)
+    known, blind = unscaled(2), unscaled(2)
+    for batch in x:
+        known = observe(known, batch, valid)
+        blind = observe(blind, jnp.where(valid[..., None], batch, 1e6), valid)
+    seen = np.asarray(x)[:, np.asarray(valid)].reshape(-1, 2)
+    np.testing.assert_allclose(known.mean, seen.mean(0), rtol=1e-5)
+    np.testing.assert_allclose(jnp.sqrt(known.variance), seen.std(0), rtol=0.05)  # batches have means of their own
+    jax.tree.map(np.testing.assert_array_equal, known, blind)
+    made = np.asarray(standardised(known, jnp.asarray(seen)))
+    np.testing.assert_allclose(made.mean(0), 0, atol=1e-4)
+    np.testing.assert_allclose(made.std(0), [0.91, 1.0], rtol=0.05)  # 0.01 / (0.01 + 0.001): the quiet stay quieter
+
+
+def test_a_scale_forgets_and_its_entries_are_bounded():
+    old = Scale(jnp.zeros(1), jnp.ones(1), jnp.array(1e6))
+    after = jax.lax.fori_loop(0, 5000, lambda _, scale: observe(scale, jnp.full((3, 1), 7.0), jnp.ones(3, bool)), old)
+    np.testing.assert_allclose(after.mean, 7.0, rtol=0.01)  # e^-5 of the old mean is left
+    np.testing.assert_array_equal(standardised(old, jnp.array([-1e9])), [-10.0])
+    assert float(standardised(None, jnp.array([1e9]))[0]) == 1e9

@@ -1,0 +1,119 @@
+"""n-step returns: against plain Python, at every kind of end; in the agents; what they are for."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from agents.moments import SMALL, SPEC, windows
+from beliefrl import agents
+from beliefrl.models.returns import n_step_returns, transition_batch
+from beliefrl.types import Step
+
+GAMMA = 0.9
+
+
+def step_of(rewards, firsts, terminated):
+    rewards = jnp.asarray(rewards, float)[:, None]
+    moments = len(rewards)
+    return Step(
+        jnp.arange(moments, dtype=float)[:, None, None],
+        rewards,
+        jnp.arange(moments, dtype=float)[:, None, None],
+        jnp.asarray(firsts, bool)[:, None],
+        jnp.asarray(terminated, bool)[:, None],
+    )
+
+
+def plainly(rewards, firsts, terminated, first, n):
+    """The return that begins at one moment, by walking."""
+    total, now = 0.0, first
+    while now - first < n and now + 1 < len(rewards) and not firsts[now + 1] and not terminated[now]:
+        total += GAMMA ** (now - first) * rewards[now + 1]
+        now += 1
+    return now, total, terminated[now], GAMMA ** (now - first)
+
+
+moments = st.integers(3, 12).flatmap(
+    lambda count: st.tuples(
+        st.lists(st.floats(-2, 2, width=32), min_size=count, max_size=count),
+        st.lists(st.booleans(), min_size=count, max_size=count),
+        st.lists(st.booleans(), min_size=count, max_size=count),
+    )
+)
+
+
+@settings(deadline=None, max_examples=40)
+@given(moments, st.sampled_from([1, 2, 3, 5, 20]))
+def test_returns_are_those_of_walking_along_the_episode(given_moments, n):
+    rewards, firsts, ends = given_moments
+    terminated = [end and i + 1 < len(firsts) and firsts[i + 1] for i, end in enumerate(ends)]
+    step = step_of(rewards, firsts, terminated)
+    valid = ~step.is_first[1:]
+    returns = n_step_returns(step, valid, n, GAMMA)
+    for first in np.flatnonzero(valid[:, 0]):
+        end, total, terminal, discount = plainly(rewards, firsts, terminated, first, n)
+        assert returns.end[first, 0] == end
+        assert bool(returns.terminated[first, 0]) == terminal
+        np.testing.assert_allclose(returns.reward[first, 0], total, rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(returns.discount[first, 0], discount, rtol=1e-6)
+
+
+def test_a_truncated_episode_bootstraps_from_its_last_moment_and_a_terminated_one_does_not():
+    firsts = [True, False, False, True, False, False]
+    step = step_of([0, 1, 1, 0, 1, 1], firsts, [False, False, False, False, False, True])
+    beliefs = 10.0 * jnp.arange(6)[:, None, None]
+    batch = transition_batch(step, ~step.is_first[1:], beliefs, beliefs, 4, GAMMA)
+    np.testing.assert_array_equal(batch.next_belief[:, 0, 0][batch.valid[:, 0]], [20, 20, 50, 50])
+    np.testing.assert_array_equal(batch.terminated[:, 0][batch.valid[:, 0]], [False, False, True, True])
+    np.testing.assert_allclose(batch.reward[:, 0][batch.valid[:, 0]], [1 + GAMMA, 1, 1 + GAMMA, 1])
+
+
+@pytest.mark.parametrize(
+    "name", ["sac-mlp", *(pytest.param(name, marks=pytest.mark.slow) for name in ("vrm", "sac-lstm", "slac"))]
+)
+def test_every_agent_learns_from_n_steps_and_as_often_as_it_is_told(name):
+    settings = {"policy_layers": (8,), "value_layers": (8,), "batch_size": 2}
+    settings |= {
+        "vrm": {**SMALL, "store_first_impression": False},
+        "sac-lstm": {"d_size": 8, "seq_len": 6, "burn_in": 4},
+    }.get(name, {})
+    settings |= {"slac": {"z1_size": 4, "z2_size": 4, "model_layers": (8,), "history": 3, "seq_len": 6}}.get(name, {})
+    one, five = (agents.make(name, updates_per_step=3, n_step=n, **settings) for n in (1, 5))
+    state = jax.jit(lambda key: five.init(key, SPEC))(jax.random.key(0))
+    given = windows(jax.random.key(1), five.cycle_windows, five.window.burn_in + five.window.length + 1)
+    batches = [jax.jit(agent.begin_cycle)(state, given, jax.random.key(2))[1] for agent in (one, five)]
+    assert {len(leaf) for leaf in jax.tree.leaves(batches[1])} == {3 * five.cycle}
+    if name == "sac-lstm":  # its batches are windows, and the transitions come in an update
+        losses = [jax.jit(agent.update)(state, first(batches[0]), jax.random.key(3))[1] for agent in (one, five)]
+        assert losses[0]["loss_q"] != losses[1]["loss_q"]
+        return
+    np.testing.assert_array_equal(batches[0].belief, batches[1].belief)
+    np.testing.assert_allclose(batches[0].discount, five.gamma)
+    np.testing.assert_allclose(jnp.min(batches[1].discount), five.gamma**5, rtol=1e-6)
+    after = jax.jit(five.update)(state, first(batches[1]), jax.random.key(3))
+    assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(after))
+
+
+def first(batches):
+    return jax.tree.map(lambda leaf: leaf[0], batches)
+
+
+def test_values_start_where_they_are_told():
+    agent = agents.make("sac-mlp", value_start=100.0)
+    controller = agent.init(jax.random.key(0), SPEC).controller
+    obs = jax.random.normal(jax.random.key(1), (64, SPEC.obs_dim))
+    for value in (controller.value, controller.target_value):
+        np.testing.assert_allclose(jax.vmap(value)(obs), 100.0, atol=1.0)
+    np.testing.assert_allclose(controller.q(obs, jnp.zeros((64, SPEC.action_dim))), 100.0, atol=1.0)
+
+
+def test_targets_grow_with_the_steps_of_the_return():
+    """With V̄ = 0 the target is the sum of the rewards: (1 - γ^n) / (1 - γ)."""
+    for n in (1, 5):
+        agent = agents.make("sac-mlp", n_step=n, batch_size=8)
+        window = windows(jax.random.key(1), 8, n + 1)
+        batch = agent.batch(window._replace(step=window.step._replace(reward=jnp.ones((8, n + 1)))))
+        np.testing.assert_allclose(batch.reward, (1 - agent.gamma**n) / (1 - agent.gamma), rtol=1e-5)

@@ -1,0 +1,178 @@
+"""Training on the host's environments: equal to the compiled loop, in processes or not; and faults lose nothing."""
+
+import dataclasses
+import re
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnasium import spaces
+from test_phases import MODELS, SEQUENCES, SHARED, leaves, trained
+
+from beliefrl import agents, evaluate, load, tasks, train
+from beliefrl.runs.run import Run
+from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
+from beliefrl.tasks.pendulum import Pendulum, PendulumState
+from beliefrl.training import host_loop, phases
+from beliefrl.training.lockstep import Lockstep
+from beliefrl.types import UserError
+from worlds import Counting, CountingAgent
+from wrong import Fine, Killed, Raising
+
+SMALL = {"vrm": MODELS | SEQUENCES, "sac-mlp": {"batch_size": 8, "pretrain_updates": 10, "standardise": True}}
+
+
+@dataclasses.dataclass(frozen=True)
+class Hanging(Pendulum):
+    """Begins at one state, so that no random number is the task's."""
+
+    def reset(self, key):
+        state = PendulumState(jnp.array(3.0), jnp.array(0.5))
+        return state, self.observation(state)
+
+
+class Wrapped(gymnasium.Env):
+    """A JAX task as a Gymnasium environment."""
+
+    def __init__(self, task):
+        self.task = task
+        spec = task.spec
+        self.observation_space = spaces.Box(-np.inf, np.inf, (spec.obs_dim,), np.float32)
+        self.action_space = spaces.Box(-1.0, 1.0, (spec.action_dim,), np.float32)
+        self._step = jax.jit(task.step)
+
+    def reset(self, *, seed=None, options=None):
+        self.time, (self.state, obs) = 0, self.task.reset(jax.random.key(0))
+        return np.asarray(obs), {}
+
+    def step(self, action):
+        self.state, obs, reward, terminated = self._step(self.state, jnp.asarray(action), jax.random.key(0))
+        self.time += 1
+        end = bool(terminated), self.time >= self.task.spec.max_steps
+        return np.asarray(obs), float(reward), *end, {"is_success": bool(self.task.success(self.state))}
+
+
+@pytest.mark.parametrize("name", ["sac-mlp", pytest.param("vrm", marks=pytest.mark.slow)])
+def test_the_host_loop_learns_what_the_compiled_loop_learns(name):
+    agent, task = agents.make(name, **SHARED, **SMALL[name]), Hanging(max_steps=9)
+    keys = jax.random.split(jax.random.key(0), 2)
+    wrapped = GymnasiumTask(Wrapped, "wrapped", {"task": task})
+    there, told = trained(phases.compile_program(agent, task, 200, 2), keys, cycle=agent.cycle)
+    program = host_loop.program(agent, wrapped, 200, 2, range(2), "never")
+    here, told_here = trained(program, keys, cycle=agent.cycle)
+    program.close()
+    theirs = there._replace(actor=there.actor._replace(task_state=()))
+    for ours, their in zip(leaves(here), leaves(theirs), strict=True):
+        np.testing.assert_allclose(ours, their, rtol=1e-3, atol=1e-4)
+    for name, values in told[-1].metrics.items():
+        np.testing.assert_allclose(told_here[-1].metrics[name], values, rtol=1e-2, atol=1e-3)
+    for one, other in zip(told, told_here, strict=True):
+        for ours, their in zip(other.episodes, one.episodes, strict=True):
+            np.testing.assert_allclose(
+                np.asarray(ours)[other.episodes.done], np.asarray(their)[np.asarray(one.episodes.done)], rtol=1e-4
+            )
+
+
+def test_every_window_is_unbroken_in_time():
+    task = Counting()
+    wrapped = GymnasiumTask(Wrapped, "counting", {"task": task}, has_success=True)
+    program = host_loop.program(CountingAgent(), wrapped, 60, 3, range(2), "never")
+    seeds = program.begin(jax.random.split(jax.random.key(0), 2))
+    seeds, told = program.explore(seeds, 0, 10)
+    assert told.episodes.done.sum() == 2  # of seven steps each
+    seeds, _ = program.pretrain(seeds, 0, 3)
+    seeds = program.relive(seeds)
+    seeds, told = program.learn(seeds, 10, 20)
+    assert np.all(told.metrics["valid"] > 0)
+    assert not np.any(told.metrics["broken"])
+    np.testing.assert_allclose(told.episodes.total[told.episodes.done], 28.0)
+    assert np.all(told.episodes.success[told.episodes.done])
+    result = program.evaluate(seeds.state, seeds.key)
+    np.testing.assert_allclose(result.total, np.full((2, 2, 3), 28.0))
+    assert result.done.all()
+    program.close()
+
+
+def played(lanes, steps=25):
+    seen = [lanes.reset(np.array([3, 4]))]
+    actions = np.random.default_rng(0).uniform(-1, 1, (steps, 2, 1)).astype(np.float32)
+    for action in actions:
+        obs, reward, terminated, truncated, success = lanes.step(action)
+        done = terminated | truncated
+        seen += [obs, reward, done, success]
+        if done.any():
+            seen.append(lanes.restart(done))
+    lanes.close()
+    return seen
+
+
+@pytest.mark.parametrize("task", [GymnasiumTask(Fine), tasks.make("gym:Pendulum-v1")], ids=lambda task: task.name)
+def test_processes_of_their_own_change_nothing_and_end(task):
+    alone, apart = Lockstep(task, ["a", "b"], "never"), Lockstep(task, ["a", "b"], "always")
+    assert not alone.apart
+    assert apart.apart
+    workers = apart._envs.processes
+    for ours, theirs in zip(played(alone), played(apart), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    assert not any(worker.is_alive() for worker in workers)
+
+
+@pytest.mark.parametrize(
+    ("make", "phrase"),
+    [
+        (Raising, r"robot \(seed [01], step 3\): step raised ValueError: out of range\.$"),  # whichever is heard last
+        (Killed, r"robot \(step 3\): the process of seed [01] \(exit code -9\)"),
+    ],
+)
+def test_a_fault_in_a_process_of_its_own_is_told_as_well(make, phrase):
+    lanes = Lockstep(GymnasiumTask(make, "robot"), ["seed 0", "seed 1"], "always")
+    lanes.reset(np.array([0, 1]))
+    with pytest.raises(Fault) as error:  # noqa: PT012
+        for _ in range(5):
+            lanes.step(np.zeros((2, 1), np.float32))
+    lanes.close()
+    assert re.match(phrase, str(error.value))
+
+
+class Late(Fine):
+    """Fails at its 27th step in all."""
+
+    steps = 0
+
+    def step(self, action):
+        self.steps += 1
+        if self.steps == 27:
+            raise RuntimeError("the battery is empty")
+        return super().step(action)
+
+
+def few(**changes):
+    return {"steps": 40, "eval_every": 20, "eval_episodes": 2, "seeds": 2, "seed": 5} | changes
+
+
+def test_what_was_learned_before_a_fault_is_kept(tmp_path):
+    agent = agents.make("sac-mlp", **SHARED, **SMALL["sac-mlp"])
+    task = GymnasiumTask(Late, "robot")
+    with pytest.raises(UserError, match=r"robot \(seed 5, step 27\): step raised RuntimeError: the battery is empty\."):
+        train(agent, task, tmp_path / "run", **few())
+    run = Run(tmp_path / "run")
+    for seed in (5, 6):
+        assert [row["step"] for row in run.rows(seed, "evaluation")] == [20]
+        assert [row["length"] for row in run.rows(seed, "episode")] == [10, 10]
+        assert [row["step"] for row in run.rows(seed, "update")][-1] == 26  # as far as it came
+    action, _ = load(run, task=GymnasiumTask(Fine)).predict(np.zeros(2))
+    assert np.all(np.abs(action) <= 1)
+
+
+@pytest.mark.slow
+def test_a_run_on_an_environment_is_evaluated_again(tmp_path):
+    agent = agents.make("sac-mlp", **SHARED, **SMALL["sac-mlp"])
+    run = train(agent, "gym:Pendulum-v1", tmp_path / "run", **few(steps=25, eval_every=25))
+    assert run.config["task"] == "gym:Pendulum-v1"
+    assert len(list(run.rows(5, "episode"))) == 0
+    results = evaluate(run, episodes=1)
+    assert results == evaluate(run, episodes=1)
+    assert results["sampled"]["seeds"] != results["mode"]["seeds"]
+    assert all(-2000 < total < 0 for total in results["mode"]["seeds"])

@@ -1,0 +1,171 @@
+"""The compiled phases: windows are unbroken, seeds alone as together up to rounding, cuts change nothing."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from beliefrl import agents, tasks
+from beliefrl.training import phases
+from worlds import Counting, CountingAgent
+
+SHARED = {"step_start_rl": 20, "policy_layers": (8,), "value_layers": (8,)}
+MODELS = {"train_times_fivrm": 10, "d_size": 8, "z_size": 4, "hidden_size": 8}
+SEQUENCES = {"seq_len": 8, "burn_in": 4, "batch_size": 2}
+SMALL = {
+    "vrm": MODELS | SEQUENCES | {"standardise": True},
+    "vrm-single": MODELS | SEQUENCES,
+    "sac-mlp": {"batch_size": 8, "pretrain_updates": 10, "standardise": True},
+    "sac-lstm": {"d_size": 8, "pretrain_updates": 10} | SEQUENCES,
+    "slac": {"z1_size": 2, "z2_size": 4, "model_layers": (8,), "batch_size": 2, "pretrain_updates": 10},
+}
+
+
+def trained(program, keys, cuts=(10, 10), learn=(10, 15), cycle=5):
+    """Explore, pre-train, relive and learn, in stretches of these lengths."""
+    seeds, step, told = program.begin(keys), 0, []
+    for steps in cuts:
+        seeds, stretch = program.explore(seeds, step, steps)
+        step += steps
+    seeds, _ = program.pretrain(seeds, 0, 10)
+    seeds = program.relive(seeds)
+    for steps in learn:
+        seeds, stretch = program.learn(seeds, step, steps // cycle)
+        told.append(jax.tree.map(np.asarray, stretch))
+        step += steps
+    return seeds, told
+
+
+@pytest.fixture(
+    scope="module",
+    params=[name if name == "vrm" else pytest.param(name, marks=pytest.mark.slow) for name in SMALL],
+)
+def small(request):
+    """A small agent's training program and its agent's cycle."""
+    agent, task = agents.make(request.param, **SHARED, **SMALL[request.param]), tasks.make("pendulum-p", max_steps=9)
+    return phases.compile_program(agent, task, capacity=200, episodes=2), agent.cycle
+
+
+def leaves(tree):
+    return [
+        np.asarray(jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x)
+        for x in jax.tree.leaves(tree)
+    ]
+
+
+@pytest.fixture
+def doubles():
+    """Numbers of 64 bits: with 32, rounding can decide a gradient that is zero but for it, a whole step to Adam."""
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.mark.usefixtures("doubles")
+def test_a_seed_among_others_learns_as_it_does_alone_up_to_rounding(small):
+    program, cycle = small
+    keys = jax.random.split(jax.random.key(0), 3)
+    together, told = trained(program, keys, cycle=cycle)
+    alone, told_alone = trained(program, keys[1:2], cycle=cycle)
+    for ours, theirs in zip(leaves(together), leaves(alone), strict=True):
+        np.testing.assert_allclose(ours[1], theirs[0], rtol=1e-10, atol=1e-12)
+    for name, values in told[-1].metrics.items():
+        np.testing.assert_allclose(values[1], told_alone[-1].metrics[name][0], rtol=1e-9, atol=1e-10)
+    assert not np.allclose(leaves(together.state)[0][0], leaves(together.state)[0][1])
+
+
+@pytest.mark.usefixtures("doubles")
+def test_no_result_depends_on_where_the_training_is_cut(small):
+    program, cycle = small
+    keys = jax.random.split(jax.random.key(0), 1)
+    one, _ = trained(program, keys, cuts=(20,), learn=(25,), cycle=cycle)
+    other, _ = trained(program, keys, cuts=(7, 12, 1), learn=(5, 15, 5), cycle=cycle)
+    for ours, theirs in zip(leaves(one), leaves(other), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+class KeyKeeper(CountingAgent):
+    """Makes more updates than steps, and keeps the key of each."""
+
+    def init(self, key, spec):
+        return super().init(key, spec)._replace(seen=jnp.zeros((120, 2), jnp.uint32))
+
+    def begin_cycle(self, state, windows, key):
+        return state, jnp.arange(10), {}
+
+    def update(self, state, batch, key):
+        return state._replace(seen=jnp.roll(state.seen, 1, axis=0).at[0].set(jax.random.key_data(key))), {}
+
+
+def test_an_update_is_made_for_every_batch_and_no_two_have_one_key():
+    agent = KeyKeeper()
+    seed = phases.begin(agent, Counting(), 100, jax.random.key(0))
+    for first in range(10, 10 + 12 * agent.cycle, agent.cycle):
+        state, _ = phases.learn_cycle(agent, seed, jnp.array(first))
+        seed = seed._replace(state=state)
+    assert len({tuple(key) for key in np.array(seed.state.seen).tolist()}) == 120
+    assert np.array(seed.state.seen).any(axis=1).all()
+
+
+def counting(steps=120, task=None):
+    agent = CountingAgent()
+    traces = []
+
+    class Traced(Counting):
+        def step(self, state, action, key):
+            traces.append(1)
+            return super().step(state, action, key)
+
+    task = task or Traced()
+    program = phases.compile_program(agent, task, capacity=90, episodes=2)
+    seeds = program.begin(jax.random.split(jax.random.key(0), 2))
+    told, counts = [], []
+    for first, length in ((0, 4), (4, 6)):
+        seeds, _ = program.explore(seeds, first, length)
+        counts.append(len(traces))
+    for first in (0, 1):
+        seeds, metrics = program.pretrain(seeds, first, 1 + first)
+        told.append(metrics)
+    seeds = program.relive(seeds)
+    step = 10
+    for cycles in (1, 3, 5, steps // 4 - 9):
+        seeds, stretch = program.learn(seeds, step, cycles)
+        step += 4 * cycles
+        told.append(stretch.metrics)
+        counts.append(len(traces))
+    return seeds, told, counts
+
+
+def test_every_window_of_a_training_is_unbroken():
+    """The counter that the task shows is the agent's own count, through memory, resets, replay and its wrapping."""
+    for task in (Counting(max_steps=7), Counting(ends=3), Counting(ends=1), Counting(max_steps=50)):
+        seeds, told, _ = counting(task=task)
+        for metrics in told:
+            np.testing.assert_array_equal(metrics["broken"], 0)
+            assert (np.asarray(metrics["valid"]) > 0).all()
+        assert (np.asarray(seeds.state.seen) > 0).all()
+
+
+def test_each_phase_is_compiled_once_whatever_the_stretch():
+    _, _, counts = counting()
+    explore, learn = counts[:2], counts[2:]
+    assert explore[0] == explore[1]
+    assert len(set(learn)) == 1
+
+
+def test_steps_are_counted_as_environment_steps():
+    task = Counting(max_steps=7)
+    agent = CountingAgent()
+    program = phases.compile_program(agent, task, capacity=90, episodes=2)
+    seeds = program.begin(jax.random.split(jax.random.key(0), 1))
+    seeds, stretch = program.explore(seeds, 0, 50)
+    assert int(seeds.replay.added[0]) == 50 + 50 // 7  # every end of an episode is one moment more
+    assert int(stretch.episodes.done.sum()) == 50 // 7
+    assert int(seeds.actor.length[0]) == 50 % 7
+
+
+def test_evaluation_leaves_training_alone_and_separates_modes():
+    program = phases.compile_program(CountingAgent(), Counting(ends=4), capacity=90, episodes=3)
+    keys = jax.random.split(jax.random.key(0), 2)
+    result = program.evaluate(program.begin(keys).state, keys)
+    assert result.total.shape == (2, 2, 3)
+    np.testing.assert_array_equal(result.total, 10)

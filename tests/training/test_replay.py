@@ -1,0 +1,137 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from beliefrl.training import replay as ring
+from beliefrl.types import Moment, Step, WindowShape, transitions
+
+
+def moment(number, is_first):
+    """A moment that carries its own running number everywhere."""
+    value = jnp.asarray(number, float)
+    step = Step(value[None], value, value[None], jnp.asarray(is_first), jnp.array(False))
+    return Moment(step, (value,))
+
+
+@jax.jit
+def fill(replay, numbers, firsts, keep):
+    def add(replay, inputs):
+        number, first, keep = inputs
+        return ring.add(replay, moment(number, first), keep), None
+
+    return jax.lax.scan(add, replay, (numbers, firsts, keep))[0]
+
+
+def filled(capacity, firsts, keep=None):
+    firsts = np.asarray(firsts, bool)
+    keep = np.ones(len(firsts), bool) if keep is None else np.asarray(keep)
+    return fill(ring.init(moment(0, False), capacity), jnp.arange(len(firsts)), jnp.asarray(firsts), jnp.asarray(keep))
+
+
+sample = jax.jit(ring.sample, static_argnums=(2, 3))
+
+
+@settings(deadline=None, max_examples=25)
+@given(
+    st.lists(st.booleans(), min_size=2, max_size=40),
+    st.sampled_from([5, 16, 64]),
+    st.sampled_from([WindowShape(0, 3), WindowShape(4, 6), WindowShape(7, 20)]),
+)
+def test_windows_are_the_newest_moments_in_order(firsts, capacity, shape):
+    replay = filled(capacity, firsts)
+    stored = np.arange(len(firsts))[-capacity:]
+    window = sample(replay, jax.random.key(0), 8, shape)
+    numbers, exists = np.array(window.note[0]), np.array(window.exists)
+    for row, there, is_first in zip(numbers, exists, np.array(window.step.is_first), strict=True):
+        seen = row[there].astype(int)
+        assert len(seen) > 0
+        np.testing.assert_array_equal(np.diff(seen), 1)
+        assert set(seen) <= set(stored)
+        expected = np.array([firsts[n] or n == stored[0] for n in seen])
+        np.testing.assert_array_equal(is_first[there], expected)
+
+
+@settings(deadline=None, max_examples=15)
+@given(st.lists(st.booleans(), min_size=3, max_size=30), st.sampled_from([8, 64]))
+def test_exactly_the_transitions_within_episodes_can_be_drawn(firsts, capacity):
+    shape = WindowShape(3, 5)
+    replay = filled(capacity, firsts)
+    stored = range(max(len(firsts) - capacity, 0), len(firsts))
+    expected = {n for n in stored[:-1] if not firsts[n + 1]}
+    window = sample(replay, jax.random.key(1), 600, shape)
+    valid = np.array(transitions(window, shape.burn_in))
+    now = np.array(window.note[0])[:, shape.burn_in : -1]
+    assert set(now[valid].astype(int)) == expected
+
+
+def test_a_masked_addition_leaves_the_ring_alone():
+    keep = np.arange(20) % 3 != 0
+    replay = filled(64, np.zeros(20, bool), keep)
+    assert int(replay.added) == keep.sum()
+    np.testing.assert_array_equal(replay.moments.note[0][: keep.sum()], np.arange(20)[keep])
+
+
+def test_starts_are_uniform():
+    shape, count = WindowShape(2, 4), 30
+    window = sample(filled(64, np.zeros(count, bool)), jax.random.key(2), 20_000, shape)
+    starts = np.array(window.note[0])[:, shape.burn_in].astype(int)
+    drawn = np.bincount(starts, minlength=count)
+    possible = count - shape.length
+    assert set(np.flatnonzero(drawn)) == set(range(possible))
+    assert np.abs(drawn[:possible] / drawn.sum() * possible - 1).max() < 0.2
+
+
+def episodes_of(firsts):
+    """The numbers of the first and the last moment of every episode."""
+    begins = np.flatnonzero(firsts)
+    return list(zip(begins, np.append(begins[1:], len(firsts)) - 1, strict=True))
+
+
+@settings(deadline=None, max_examples=15)
+@given(st.lists(st.booleans(), min_size=3, max_size=30), st.sampled_from([8, 64]))
+def test_windows_of_one_episode_end_with_it(firsts, capacity):
+    firsts[0] = True
+    shape, oldest = WindowShape(3, 5, one_episode=True), max(len(firsts) - capacity, 0)
+    window = sample(filled(capacity, firsts), jax.random.key(1), 600, shape)
+    numbers, exists = np.array(window.note[0]).astype(int), np.array(window.exists)
+    firsts_stored = [i == oldest or firsts[i] for i in range(len(firsts))]
+    firsts_stored[:oldest] = [False] * oldest
+    of_moment = np.cumsum(firsts_stored)
+    for row, there, is_first in zip(numbers, exists, np.array(window.step.is_first), strict=True):
+        assert len(set(of_moment[row[there]])) <= 1
+        np.testing.assert_array_equal(np.diff(row[there]), 1)
+        np.testing.assert_array_equal(is_first[there], [firsts_stored[n] for n in row[there]])
+    valid = np.array(transitions(window, shape.burn_in))
+    drawn = set(numbers[:, shape.burn_in : -1][valid])
+    assert drawn == {n for n in range(oldest, len(firsts) - 1) if not firsts_stored[n + 1]}
+
+
+def test_episodes_are_drawn_as_the_authors_draw_them():
+    """In proportion to T + 2 length - 2; starts from length - 1 before the first transition to the last but one."""
+    firsts = np.zeros(50, bool)
+    firsts[[0, 3, 20]] = True
+    shape = WindowShape(0, 4, one_episode=True)
+    window = sample(filled(64, firsts), jax.random.key(2), 40_000, shape)
+    numbers, exists = np.array(window.note[0]).astype(int), np.array(window.exists)
+    assert exists.any(axis=1).all()
+    start = np.where(exists, numbers - np.arange(5), 10**6).min(axis=1)  # of those that overhang it lies before
+    seen = np.where(exists, numbers, -1).max(axis=1)
+    for begin, end in episodes_of(firsts):
+        within, length = (seen >= begin) & (seen <= end), end - begin
+        total = sum(end - begin + 6 for begin, end in episodes_of(firsts))
+        np.testing.assert_allclose(within.mean(), (length + 6) / total, rtol=0.03)
+        starts = np.bincount(start[within] - begin + 3)
+        assert len(starts) == length - 1 + 3
+        np.testing.assert_allclose(starts / starts.sum(), 1 / len(starts), rtol=0.25)
+
+
+def test_history_and_annotate_address_the_first_moments():
+    replay = filled(64, [True, False, False, True, False])
+    steps, exists = ring.history(replay, 8)
+    np.testing.assert_array_equal(exists, np.arange(8) < 5)
+    np.testing.assert_array_equal(steps.reward[:5], np.arange(5))
+    replay = ring.annotate(replay, (jnp.arange(8.0) * 10,), 8)
+    np.testing.assert_array_equal(replay.moments.note[0][:5], np.arange(5) * 10)
+    np.testing.assert_array_equal(replay.moments.step.reward[:5], np.arange(5))

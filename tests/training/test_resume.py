@@ -1,0 +1,332 @@
+"""A training that is stopped, killed or extended goes on, on a CPU to the last bit; what cannot go on says why."""
+
+import json
+import os
+import shutil
+import signal
+import threading
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from beliefrl import agents, load, resume, train
+from beliefrl.analysis.curves import draw_curve, evaluations
+from beliefrl.cli import main
+from beliefrl.runs.arrays import load as load_arrays
+from beliefrl.runs.checkpoint import listed
+from beliefrl.runs.run import Recorder, Run
+from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.training.stop import Stopped
+from beliefrl.types import UserError
+from wrong import Fine, Raising
+
+SIZES = {"policy_layers": (8,), "value_layers": (8,), "batch_size": 8, "standardise": True}
+AGENT = agents.make("sac-mlp", step_start_rl=20, pretrain_updates=150, **SIZES)
+OPTIONS = {"steps": 240, "seeds": 2, "eval_every": 120, "eval_episodes": 1, "checkpoint_steps": 1}
+
+
+class Crash(Exception):
+    """The machine dies."""
+
+
+def crash_at(number):
+    """A report that crashes at the event of that number."""
+    seen = []
+
+    def report(event):
+        seen.append(event)
+        if len(seen) == number:
+            raise Crash
+
+    return report
+
+
+def files(folder):
+    """The contents of what a run has learned and logged."""
+    paths = [*sorted((folder / "metrics").iterdir()), folder / "agent.safetensors", folder / "results.json"]
+    return {path.name: path.read_bytes() for path in paths}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A training that nothing happened to."""
+    folder = tmp_path_factory.mktemp("whole") / "run"
+    events = []
+    train(AGENT, "pendulum-v", folder, events.append, **OPTIONS)
+    return folder, len(events)
+
+
+@pytest.mark.parametrize(
+    "share", [pytest.param(0.3, marks=pytest.mark.slow), 0.6, pytest.param(0.99, marks=pytest.mark.slow)]
+)
+def test_a_crashed_training_goes_on_to_the_last_bit(whole, tmp_path, share):
+    folder, events = whole
+    with pytest.raises(Crash):
+        train(AGENT, "pendulum-v", tmp_path / "run", crash_at(max(int(share * events), 5)), **OPTIONS)
+    assert listed(tmp_path / "run")
+    resume(tmp_path / "run")
+    assert files(tmp_path / "run") == files(folder)
+
+
+LINE = "train sac-mlp pendulum-v --step-start-rl 20 --pretrain-updates 150 --policy-layers 8 --value-layers 8"
+LINE += " --batch-size 8 --standardise --steps 240 --seeds 2 --eval-every 120 --eval-episodes 1"
+LINE += " --checkpoint-steps 1 --resume --out"
+
+
+@pytest.mark.parametrize(
+    ("command", "left"),
+    [
+        ("resume", "a log and half a checkpoint"),
+        ("train --resume", "a log"),
+        pytest.param("train --resume", "no config", marks=pytest.mark.slow),
+        pytest.param("train", "a log", marks=pytest.mark.slow),
+        pytest.param("python", "a log", marks=pytest.mark.slow),
+    ],
+)
+def test_a_training_that_was_killed_before_its_first_checkpoint_begins_again(whole, tmp_path, capsys, command, left):
+    folder = tmp_path / "run"
+    (folder / "metrics").mkdir(parents=True)
+    if left != "no config":
+        (folder / "config.json").write_bytes((whole[0] / "config.json").read_bytes())
+        (folder / "metrics" / "seed-0.jsonl").write_text('{"step": 20, "kind": "update"}\n')
+    if left == "a log and half a checkpoint":
+        (folder / "checkpoints" / ".000001-step-10.tmp").mkdir(parents=True)
+        (folder / "checkpoints" / "replay").mkdir()
+        (folder / "checkpoints" / "replay" / "000001.safetensors").write_bytes(b"half")
+    if command == "python":
+        resume(folder, report=lambda event: event.note and print(event.note))
+    else:
+        lines = {"resume": "resume", "train": LINE.replace("--resume ", ""), "train --resume": LINE}
+        main([*lines[command].split(), str(folder)])
+    assert files(folder) == files(whole[0])
+    is_resumed = left != "no config" and command != "train"
+    assert ("no checkpoint was written: begins again from step 0" in capsys.readouterr().out) == is_resumed
+    assert len(Run(folder).config.get("resumed", ())) == is_resumed
+
+
+def test_what_is_no_unfinished_training_is_not_cleared(whole, tmp_path, capsys):
+    finished, other = tmp_path / "finished", tmp_path / "other"
+    shutil.copytree(whole[0], finished, ignore=shutil.ignore_patterns("checkpoints"))
+    (other / "metrics").mkdir(parents=True)
+    (other / "metrics" / "thesis.tex").touch()
+    for folder, why in ((finished, "has no checkpoint to go on from any more"), (other, "exists already")):
+        before = sorted(folder.rglob("*"))
+        with pytest.raises(SystemExit):
+            main([*LINE.split(), str(folder)])
+        assert why in capsys.readouterr().err
+        assert sorted(folder.rglob("*")) == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["vrm", "sac-lstm", "slac"])
+def test_every_agent_goes_on_to_the_last_bit(tmp_path, name):
+    models = {"train_times_fivrm": 10, "d_size": 8, "z_size": 4, "hidden_size": 8}
+    sequences = {"seq_len": 8, "burn_in": 4, "batch_size": 2}
+    sizes = {
+        "vrm": models | sequences,
+        "sac-lstm": {"d_size": 8, "pretrain_updates": 10} | sequences,
+        "slac": {"z1_size": 2, "z2_size": 4, "model_layers": (8,), "batch_size": 2, "pretrain_updates": 10},
+    }
+    agent = agents.make(name, step_start_rl=20, policy_layers=(8,), value_layers=(8,), **sizes[name])
+    events = []
+    train(agent, "pendulum-p", tmp_path / "whole", events.append, **OPTIONS)
+    with pytest.raises(Crash):
+        train(agent, "pendulum-p", tmp_path / "run", crash_at(len(events) - 4), **OPTIONS)
+    resume(tmp_path / "run")
+    assert files(tmp_path / "run") == files(tmp_path / "whole")
+
+
+@pytest.mark.slow
+def test_a_finished_training_can_be_made_longer(whole, tmp_path):
+    folder, _ = whole
+    train(AGENT, "pendulum-v", tmp_path / "run", **OPTIONS | {"steps": 120})
+    run = resume(tmp_path / "run", steps=240)
+    assert files(run.folder) == files(folder)
+    assert run.config["options"]["steps"] == 240
+    assert len(run.config["resumed"]) == 1
+    with pytest.raises(UserError, match=r"steps=100 is impossible: .* trains for 240, and may only grow"):
+        resume(run, steps=100)
+
+
+def test_resuming_what_is_finished_changes_nothing(whole):
+    folder, _ = whole
+    before = files(folder)
+    resume(folder)
+    assert files(folder) == before
+
+
+def test_the_log_has_no_gap_and_no_row_twice(whole):
+    folder, _ = whole
+    steps = [row["step"] for row in Run(folder).rows(0, "update")]
+    assert steps == sorted(set(steps))
+    assert steps[-1] == 240
+
+
+def test_where_the_checkpoints_are_gone_there_is_a_sentence(whole, tmp_path):
+    (tmp_path / "run" / "checkpoints" / "damaged-000001-step-20").mkdir(parents=True)
+    (tmp_path / "run" / "config.json").write_bytes((whole[0] / "config.json").read_bytes())
+    with pytest.raises(UserError, match="has no checkpoint to go on from any more"):
+        resume(tmp_path / "run")
+    with pytest.raises(UserError, match="There is no run folder"):
+        resume(tmp_path / "nowhere")
+
+
+def test_a_training_that_fails_before_it_saved_anything_blocks_nothing(tmp_path):
+    folder = tmp_path / "run"
+    for number in (1, 5, 9):  # an event of the making, the exploration and the pre-training
+        with pytest.raises(Crash):
+            train(AGENT, "pendulum-v", folder, crash_at(number), **OPTIONS | {"checkpoint_steps": 0})
+    with pytest.raises(UserError, match="step raised ValueError"):
+        train(AGENT, GymnasiumTask(Raising), folder, **OPTIONS)
+    run = train(AGENT, GymnasiumTask(Fine), folder, **OPTIONS | {"steps": 20})
+    assert run.config["task"] == "Fine"
+    with pytest.raises(UserError, match="exists already: choose another --out, or `beliefrl resume"):
+        train(AGENT, "pendulum-v", folder, **OPTIONS)
+
+
+def test_a_run_that_is_being_trained_is_not_touched(whole):
+    folder, _ = whole
+    recorder = Recorder(folder, None)
+    try:
+        with pytest.raises(UserError, match=f"is being trained by process {os.getpid()}: stop it"):
+            resume(folder)
+    finally:
+        recorder.close()
+    resume(folder)
+
+
+def test_a_log_that_was_cut_is_told(whole, tmp_path):
+    with pytest.raises(Crash):
+        train(AGENT, "pendulum-v", tmp_path / "run", crash_at(whole[1] - 2), **OPTIONS)
+    (tmp_path / "run" / "metrics" / "seed-1.jsonl").write_text("")
+    with pytest.raises(UserError, match=r"seed-1\.jsonl is shorter than when the checkpoint was written"):
+        resume(tmp_path / "run")
+
+
+@pytest.mark.slow
+def test_an_environment_goes_on_from_the_start_of_an_episode(tmp_path):
+    task, notes = GymnasiumTask(Fine, "fine"), []
+    with pytest.raises(Crash):
+        train(AGENT, task, tmp_path / "run", crash_at(12), **OPTIONS)
+    run = resume(tmp_path / "run", task=task, report=lambda event: notes.append(event.note))
+    assert any("a new episode begins" in note for note in notes if note)
+    assert [row["step"] for row in run.rows(0, "evaluation")] == [120, 240]
+    assert {row["length"] for row in run.rows(0, "episode")} == {10}
+
+
+@pytest.mark.parametrize(
+    ("what", "why"),
+    [("networks", "its networks are not finite"), pytest.param("q", "q is not finite", marks=pytest.mark.slow)],
+)
+def test_a_seed_that_diverges_stops_alone(tmp_path, monkeypatch, what, why):
+    """The second seed's networks, or a loss of it, are made NaN after step 120."""
+    from beliefrl.training import phases
+
+    real = phases.compile_program
+
+    def compiled(*args):
+        program = real(*args)
+
+        def learn(seeds, first, cycles):
+            seeds, told = program.learn(seeds, first, cycles)
+            if first >= 120 and what in told.metrics:
+                told.metrics[what] = told.metrics[what].at[1].set(jnp.nan)
+            elif first >= 120:
+                alpha = seeds.state.controller.log_alpha.at[1].set(jnp.nan)
+                controller = seeds.state.controller._replace(log_alpha=alpha)
+                seeds = seeds._replace(state=seeds.state._replace(controller=controller))
+            return seeds, told
+
+        return program._replace(learn=learn)
+
+    monkeypatch.setattr(phases, "compile_program", compiled)
+    notes = []
+    run = train(AGENT, "pendulum-v", tmp_path / "run", lambda event: notes.append(event.note), **OPTIONS)
+    told = [note for note in notes if note]
+    assert len(told) == 1
+    assert told[0].startswith(f"seed 1 diverged by step 220: {why}; its last good checkpoint stays in ")
+    assert [row["step"] for row in run.rows(0, "evaluation")] == [120, 240]
+    assert [row["step"] for row in run.rows(1, "evaluation")] == [120]
+    assert run.results()["mode"]["seeds"][1] is None
+    assert run.results()["mode"]["mean"] == run.results()["mode"]["seeds"][0]
+    kept = load_arrays(run.folder / "checkpoints" / "kept-for-seed-1" / "state.safetensors")
+    assert all(np.isfinite(array).all() for array in kept.values())
+    assert np.isfinite(load(run, seed=1).predict(np.zeros(1))[0]).all()  # as it was at 120
+    _, means = evaluations(run, "mode")
+    np.testing.assert_array_equal(np.isnan(means), [[False, False], [False, True]])
+    assert draw_curve(run).exists()
+    assert json.loads((run.folder / "results.json").read_text())
+
+
+def test_the_first_signal_is_a_checkpoint_and_a_word_how_to_go_on(whole, tmp_path):
+    folder, events = whole
+    seen = []
+
+    def report(event):
+        seen.append(event)
+        if len(seen) == events // 2:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    with pytest.raises(Stopped, match=r"stopped at step \d+; `beliefrl resume .*run` goes on from there") as stopped:
+        train(AGENT, "pendulum-v", tmp_path / "run", report, **OPTIONS | {"checkpoint_steps": 0})
+    assert stopped.value.exit_code == 143
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+    resume(tmp_path / "run")
+    assert files(tmp_path / "run") == files(folder)
+
+
+def test_trainings_in_other_threads_leave_signals_alone(tmp_path):
+    failed = []
+
+    def work():
+        try:
+            train(AGENT, "pendulum-v", tmp_path / "run", **OPTIONS | {"steps": 20})
+        except BaseException as error:
+            failed.append(error)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert not failed
+
+
+def test_constants_that_are_tuples_are_the_same_when_a_run_goes_on(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    line = "train sac-mlp target-reaching --steps 4 --eval-episodes 1 --constants max_steps=2 --out run --resume"
+    for _ in range(2):
+        main(line.split())
+    with pytest.raises(SystemExit):
+        main(line.replace("max_steps=2", "max_steps=2 rewards=[1,2,3]").split())
+    assert "run was trained with constants=" in capsys.readouterr().err
+
+
+def test_a_folder_that_cannot_be_locked_is_one_sentence(whole, tmp_path):
+    (tmp_path / "lock").mkdir()
+    (tmp_path / "config.json").write_bytes((whole[0] / "config.json").read_bytes())
+    with pytest.raises(UserError, match="cannot be written"):
+        Recorder(tmp_path, None)
+
+
+@pytest.mark.parametrize(
+    ("line", "phrase"),
+    [
+        ("resume {whole} --steps 10", "may only grow"),
+        ("resume {whole} --steps ten", "--steps must be a whole number, not 'ten'"),
+        ("train sac-mlp pendulum-v --out {whole}", "exists already: choose another --out, or `beliefrl resume"),
+        ("train sac-mlp pendulum-v --out {whole} --resume", "was trained with"),
+        ("train sac-mlp pendulum --out {whole} --resume", "was trained with task=pendulum-v, not pendulum"),
+        ("train sac-mlp pendulum --observe velocities --out {whole} --resume", "was trained with seeds=2, not 1"),
+        ("train sac-mlp pendulum-v --constants mass=3.5 --out {whole} --resume", "was trained with constants="),
+        ("train vrm pendulum-v --out {whole} --resume", "was trained with agent=sac-mlp, not vrm"),
+    ],
+)
+def test_mistakes_about_runs_are_sentences(whole, tmp_path, monkeypatch, capsys, line, phrase):
+    folder, _ = whole
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main(line.format(whole=folder).split())
+    err = capsys.readouterr().err
+    assert ended.value.code == 2
+    assert phrase in err
+    assert err.count("\n") == 1

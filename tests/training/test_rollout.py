@@ -1,0 +1,97 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from beliefrl.training import replay as ring
+from beliefrl.training import rollout
+from worlds import Counting, CountingAgent
+
+AGENT = CountingAgent()
+
+
+def advanced(task, steps, key=0):
+    """The replay after some steps, as numpy, and what the steps told of episodes."""
+    actor = rollout.begin(AGENT, task, jax.random.key(key))
+    replay = ring.init(rollout.moment(AGENT, actor), 3 * steps)
+    state = AGENT.init(jax.random.key(0), task.spec)
+
+    def step(carry, key):
+        actor, replay, episode = rollout.advance(AGENT, task, state, *carry, key)
+        return (actor, replay), episode
+
+    keys = jax.random.split(jax.random.key(key + 1), steps)
+    (actor, replay), episodes = jax.jit(lambda carry: jax.lax.scan(step, carry, keys))((actor, replay))
+    moments = jax.tree.map(lambda leaf: np.asarray(leaf)[: int(replay.added)], replay.moments)
+    return moments, jax.tree.map(np.asarray, episodes), actor
+
+
+def test_a_truncated_episode_keeps_its_last_observation_and_is_not_terminal():
+    moments, episodes, _ = advanced(Counting(max_steps=7), 21)
+    np.testing.assert_array_equal(moments.step.obs[:, 0], [*range(8)] * 3)
+    np.testing.assert_array_equal(moments.step.is_first, moments.step.obs[:, 0] == 0)
+    assert not moments.step.terminated.any()
+    np.testing.assert_array_equal(np.flatnonzero(episodes.done), [6, 13, 20])
+
+
+def test_a_terminated_episode_marks_its_last_observation_only():
+    moments, episodes, _ = advanced(Counting(ends=4), 12)
+    np.testing.assert_array_equal(moments.step.obs[:, 0], [*range(5)] * 3)
+    np.testing.assert_array_equal(moments.step.terminated, moments.step.obs[:, 0] == 4)
+    np.testing.assert_array_equal(episodes.length[episodes.done], 4)
+    np.testing.assert_array_equal(episodes.total[episodes.done], 1 + 2 + 3 + 4)
+
+
+def test_termination_at_the_time_limit_is_termination():
+    moments, _, _ = advanced(Counting(ends=7, max_steps=7), 14)
+    np.testing.assert_array_equal(moments.step.terminated, moments.step.obs[:, 0] == 7)
+
+
+def test_the_moment_in_hand_is_not_in_the_replay_yet():
+    moments, _, actor = advanced(Counting(), 5)
+    np.testing.assert_array_equal(moments.step.obs[:, 0], range(5))
+    assert float(actor.step.obs[0]) == 5
+
+
+def test_first_moments_carry_no_reward_and_no_action():
+    moments, _, _ = advanced(Counting(), 21)
+    first = moments.step.is_first
+    assert not moments.step.reward[first].any()
+    assert not moments.step.prev_action[first].any()
+    assert moments.step.prev_action[~first].all()
+
+
+def test_memory_counts_unbroken_through_every_episode():
+    moments, _, _ = advanced(Counting(ends=5), 23)
+    np.testing.assert_array_equal(moments.note[0], moments.step.obs[:, 0])
+
+
+def test_success_is_reported_where_the_episode_ends():
+    for ends, success in ((4, False), (6, True)):
+        _, episodes, _ = advanced(Counting(ends=ends), 12)
+        np.testing.assert_array_equal(episodes.success[episodes.done], success)
+
+
+@pytest.mark.parametrize("steps", [10, 14])
+def test_reliving_restores_notes_and_memory(steps):
+    moments, _, actor = advanced(Counting(), steps)
+    replay = ring.init(rollout.moment(AGENT, actor), 64)
+    blank = jax.tree.map(lambda ring, new: ring.at[: new.shape[0]].set(new), replay.moments, moments)
+    blank = blank._replace(note=jax.tree.map(lambda note: note * 0 - 9, blank.note))
+    replay = ring.Replay(blank, jnp.array(moments.step.reward.shape[0]))
+    spec = Counting().spec
+    state = AGENT.init(jax.random.key(0), spec)
+    again, replay = jax.jit(lambda a, r: rollout.relive(AGENT, spec, state, a, r, jax.random.key(1), 20))(actor, replay)
+    np.testing.assert_array_equal(replay.moments.note[0][: len(moments.note[0])], moments.note[0])
+    assert float(again.memory) == float(actor.memory)
+
+
+def test_evaluation_plays_whole_episodes_and_stops_counting_at_their_end():
+    explore = jnp.array([True, True, False])
+    state = AGENT.init(jax.random.key(0), Counting().spec)
+    for task, total, length in ((Counting(), 28, 7), (Counting(ends=4), 10, 4)):
+        result = jax.jit(lambda key, task=task: rollout.evaluate(AGENT, task, state, key, explore))(jax.random.key(0))
+        assert result.done.all()
+        np.testing.assert_array_equal(result.total, total)
+        np.testing.assert_array_equal(result.length, length)
+        np.testing.assert_array_equal(result.success, length >= 5)

@@ -1,0 +1,192 @@
+"""A training from beginning to end, as a user starts it: what it leaves, says and survives."""
+
+import json
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from beliefrl import agents
+from beliefrl.analysis.curves import draw_curve
+from beliefrl.runs.run import Run
+
+TRAIN = "train vrm pendulum-v"
+SMALL = {
+    "step_start_rl": 20,
+    "policy_layers": (8, 8),
+    "value_layers": (8, 8),
+    "train_times_fivrm": 5,
+    "seq_len": 8,
+    "batch_size": 2,
+    "burn_in": 4,
+    "d_size": 8,
+    "z_size": 4,
+    "hidden_size": 8,
+}
+OPTIONS = {"steps": 60, "seeds": 2, "seed": 0, "eval_every": 30, "eval_episodes": 2}
+
+
+def flags(settings):
+    """Settings as they are given on the command line."""
+    words = []
+    for name, value in settings.items():
+        words += [f"--{name.replace('_', '-')}", *map(str, value if isinstance(value, tuple) else (value,))]
+    return words
+
+
+def program(*argv):
+    return [sys.executable, "-m", "beliefrl.cli", *map(str, argv)]
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory):
+    """A folder that all workers of pytest share."""
+    folder = tmp_path_factory.getbasetemp()
+    return folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
+
+
+def output(*command):
+    """What a program prints; it must end well, and complain of nothing."""
+    done = subprocess.run(command, capture_output=True, text=True, timeout=500)
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def trained(shared):
+    """The folder of a finished training, and what it printed; made once where several workers want it."""
+    folder = shared / "trained"
+    told = folder.with_suffix(".txt")
+    try:
+        folder.with_suffix(".lock").touch(exist_ok=False)
+    except FileExistsError:
+        wait_for(told.exists)
+    else:
+        printed = "The training failed."
+        try:
+            printed = output(*program(*TRAIN.split(), *flags(OPTIONS | SMALL), "--out", folder))
+        finally:
+            told.with_suffix(".part").write_text(printed)
+            told.with_suffix(".part").rename(told)
+    return folder, told.read_text()
+
+
+def wait_for(happened, seconds=400):
+    """Wait until something has happened."""
+    until = time.monotonic() + seconds
+    while not happened():
+        assert time.monotonic() < until
+        time.sleep(0.1)
+
+
+def rows(folder, seed, kind):
+    return list(Run(folder).rows(seed, kind))
+
+
+def test_a_training_leaves_what_the_documentation_says(trained):
+    folder, _ = trained
+    files = {"config.json", "metrics", "tensorboard", "checkpoints", "agent.safetensors", "results.json", "curve.png"}
+    files |= {"lock"}
+    assert {path.name for path in folder.iterdir()} == files
+    config = Run(folder).config
+    assert (config["agent"], config["task"]) == ("vrm", "pendulum-v")
+    assert agents.make("vrm", **SMALL) == agents.make(
+        "vrm", **{k: tuple(v) if isinstance(v, list) else v for k, v in config["hyperparameters"].items()}
+    )
+    assert OPTIONS.items() <= config["options"].items()
+    assert {"versions", "device", "git_commit", "command", "started"} <= set(config)
+    for seed in range(2):
+        (events,) = (folder / "tensorboard" / f"seed-{seed}").iterdir()
+        assert events.stat().st_size > 500
+        assert [row["step"] for row in rows(folder, seed, "pretrain")] == [5]
+        assert all(np.isfinite(row["loss_q"]) for row in rows(folder, seed, "update"))
+    assert rows(folder, 0, "update") != rows(folder, 1, "update")
+
+
+def test_a_training_is_evaluated_in_both_modes(trained):
+    folder, printed = trained
+    for seed in range(2):
+        evaluations = rows(folder, seed, "evaluation")
+        assert [row["step"] for row in evaluations] == [30, 60]
+        assert all(len(row[mode]) == 2 for row in evaluations for mode in ("sampled", "mode"))
+    results = Run(folder).results()
+    last = [rows(folder, seed, "evaluation")[-1]["mode"] for seed in range(2)]
+    np.testing.assert_allclose(results["mode"]["seeds"], np.mean(last, axis=1), rtol=1e-6)
+    table = printed[printed.index("vrm on pendulum-v after 60 steps") :]
+    assert f"{results['mode']['mean']:.1f}" in table
+    assert "saved in" in table.splitlines()[-2] + table.splitlines()[-1]
+
+
+def test_evaluate_prints_one_object_and_the_same_for_the_same_seed(trained):
+    folder, _ = trained
+    command = program("evaluate", folder, "--episodes", 3, "--json")
+    first, again, other = output(*command), output(*command), output(*command, "--seed", "1")
+    assert first == again
+    assert first != other
+    assert first.count("\n") == 1
+    result = json.loads(first)
+    assert set(result) == {"episodes", "sampled", "mode"}
+    assert result["episodes"] == 3
+    for mode in ("sampled", "mode"):
+        assert set(result[mode]) == {"mean", "sem", "seeds", "success", "seeds_success"}
+        assert len(result[mode]["seeds"]) == 2
+        assert result[mode]["success"] is None
+
+
+def test_python_gives_the_metrics_of_the_command_line(trained, tmp_path):
+    folder, _ = trained
+    script = f"""
+import beliefrl
+agent = beliefrl.make_agent("vrm", **{SMALL})
+run = beliefrl.train(agent, beliefrl.make_task("pendulum-v"), out={str(tmp_path / "run")!r}, **{OPTIONS})
+assert beliefrl.evaluate(run, episodes=1)["episodes"] == 1
+"""
+    assert output(sys.executable, "-c", script) == ""
+    for seed in range(2):
+        name = pathlib.Path("metrics") / f"seed-{seed}.jsonl"
+        assert (tmp_path / "run" / name).read_text() == (folder / name).read_text()
+
+
+@pytest.mark.slow
+def test_a_killed_training_can_be_evaluated_and_success_is_reported(tmp_path):
+    folder = tmp_path / "run"
+    options = OPTIONS | {"steps": 1_000_000, "seeds": 1, "eval_every": 50}
+    command = program("train", "vrm", "target-reaching", *flags(options | SMALL), "--out", folder)
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        log = folder / "metrics" / "seed-0.jsonl"
+        try:
+            wait_for(lambda: process.poll() is not None or (log.exists() and len(rows(folder, 0, "update")) > 5))
+        finally:
+            process.send_signal(signal.SIGKILL)
+    assert process.returncode == -signal.SIGKILL
+    assert len(rows(folder, 0, "evaluation")) >= 2
+    assert "success" in output(*program("evaluate", folder, "--episodes", 1))
+    assert json.loads(output(*program("evaluate", folder, "--episodes", 2, "--json")))["mode"]["success"] in (0, 0.5, 1)
+    assert draw_curve(Run(folder)).stat().st_size > 0
+
+
+def test_ctrl_c_ends_with_one_sentence(tmp_path):
+    settings = SMALL | {"step_start_rl": 400_000}
+    command = program(*TRAIN.split(), "--steps", 400_000, "--seeds", 1, *flags(settings), "--out", tmp_path / "run")
+    # A shell's background job ignores SIGINT, and so would what is started from it.
+    listening = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from beliefrl.cli import main; main()"
+    )
+    command = [command[0], "-c", listening, *command[command.index("train") :]]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            for line in process.stdout:
+                if line.endswith(" exploring\n"):
+                    break
+            process.send_signal(signal.SIGINT)
+            _, err = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert process.returncode == 130
+    assert err.startswith("beliefrl: stopped")
+    assert err.count("\n") == 1

@@ -1,0 +1,139 @@
+"""Films and film strips: every frame, at its time, in a file that is there whole or not at all."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image, ImageSequence
+
+import beliefrl
+from beliefrl import tasks
+from beliefrl.cli import main
+from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.types import UserError
+from beliefrl.viewing import films
+from worlds import Counter, saved
+
+TASK = tasks.make("pendulum-p", max_steps=5)
+
+
+@pytest.fixture
+def run(tmp_path):
+    return saved(tmp_path / "run", "sac-mlp", TASK)
+
+
+@pytest.fixture
+def counted(tmp_path):
+    """A run on an environment that shows what time it is, and that environment."""
+    task = GymnasiumTask(Counter)
+    return saved(tmp_path / "run", "sac-mlp", task), task
+
+
+def shown(path):
+    """Of each frame of a GIF: its time as `Counter` shows it, and its milliseconds."""
+    frames = [(np.array(frame.convert("RGB"))[0, 0, 0], frame.info["duration"]) for frame in frames_of(path)]
+    return [(round(int(level) / 10), duration) for level, duration in frames]
+
+
+def frames_of(path):
+    with Image.open(path) as image:
+        yield from ImageSequence.Iterator(image)
+
+
+def test_a_film_shows_every_step_of_every_episode(tmp_path, counted):
+    run, task = counted
+    played = films.video(run, tmp_path / "film.gif", fps=20.0, episodes=2, steps=4, task=task)
+    assert shown(tmp_path / "film.gif") == [(time, 50) for time in (0, 1, 2, 3, 4, 0, 1, 2, 3, 4)]
+    assert [episode.total for episode in played] == [10.0, 10.0]
+
+
+def test_real_time_leaves_steps_out_where_they_are_too_many_a_second(tmp_path, counted):
+    """125 steps a second are 41.7 frames a second, every third; a GIF knows hundredths of a second."""
+    run, task = counted
+    films.video(run, tmp_path / "film.gif", task=task)
+    assert shown(tmp_path / "film.gif") == [(time, 20) for time in (0, 3, 6, 9)]
+
+
+def test_an_mp4_is_as_long_as_the_episode(tmp_path, run):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg").get_ffmpeg_exe()
+    beliefrl.video(run, tmp_path / "film.mp4")  # a step is a twentieth of a second
+    read = [ffmpeg, "-loglevel", "error", "-i", tmp_path / "film.mp4", "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    pixels = subprocess.run(read, capture_output=True, check=True).stdout
+    assert len(pixels) == 6 * 480 * 512 * 3  # square, and the line below it
+    told = subprocess.run([ffmpeg, "-i", tmp_path / "film.mp4"], capture_output=True, text=True).stderr
+    assert "20 fps" in told
+    assert "yuv420p" in told
+
+
+class Failing(Counter):
+    def step(self, action):
+        if self.steps == 3:
+            raise RuntimeError("the battery is empty")
+        return super().step(action)
+
+
+class Growing(Counter):
+    def render(self):
+        return np.zeros((20, 30 + self.steps, 3), np.uint8)
+
+
+@pytest.mark.parametrize(("make", "sentence"), [(Failing, "the battery is empty"), (Growing, "of different sizes")])
+@pytest.mark.parametrize("ending", ["gif", "mp4"])
+def test_a_film_that_fails_leaves_the_old_one(tmp_path, counted, make, sentence, ending):
+    if ending == "mp4":
+        pytest.importorskip("imageio_ffmpeg")
+    path = tmp_path / f"film.{ending}"
+    path.write_bytes(b"old")
+    with pytest.raises(UserError, match=sentence):
+        films.video(counted[0], path, task=GymnasiumTask(make))
+    assert path.read_bytes() == b"old"
+    assert {each.name for each in tmp_path.iterdir()} == {"run", path.name}
+
+
+def test_a_line_below_the_picture_leaves_it_as_it_is_and_its_sides_even():
+    pixels = np.random.default_rng(0).integers(0, 256, (21, 33, 3), np.uint8)
+    image = films.caption(pixels, "step 3   return -1.5")
+    np.testing.assert_array_equal(image[:21, :33], pixels)
+    assert image.shape[0] % 2 == image.shape[1] % 2 == 0
+    assert image[22:].min() < 100 < 200 < image[22:].max()  # ink on paper
+
+
+def test_an_mp4_without_its_encoder_is_told_in_a_sentence(tmp_path, run, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(UserError, match=r"pip install 'beliefrl\[video\]', or make a \.gif"):
+        films.video(run, tmp_path / "film.mp4")
+
+
+def test_a_strip_is_evenly_spaced_from_the_first_moment_to_the_last(run):
+    assert list(films._strip(run, 3, None, 0, False, None, None).frames) == [0, 2, 5]
+    assert list(films._strip(run, 8, None, 0, False, 3, None).frames) == [0, 1, 2, 3]
+
+
+def test_a_strip_has_a_row_for_each_run(tmp_path, run):
+    other = saved(tmp_path / "other", "sac-mlp", TASK)
+    heights = []
+    for runs in ([run], [run, other]):
+        with Image.open(films.film(runs, frames=2)) as image:
+            heights.append(image.height)
+            assert image.width == 2 * 225
+    assert heights[1] == pytest.approx(2 * heights[0], abs=1)
+    assert (run.folder / "film.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_the_commands_write_their_files(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    saved(tmp_path / "run", "slac", TASK)
+    for line in (
+        "video run film.gif --steps 2 --episodes 2 --episode-seed 7",
+        "film run --frames 2 --out strip.png",
+        "predict run --start 2 --samples 2 --horizon 2",
+    ):
+        main(line.split())
+    out, err = capsys.readouterr()
+    assert err == ""
+    assert "episode 8: 2 steps, return -" in out
+    for line in ("film.gif", "strip.png and strip.pdf", "run/predictions.png and run/predictions.pdf"):
+        assert f"written to {line}\n" in out
+    names = ("film.gif", "strip.png", "strip.pdf", "run/predictions.png", "run/predictions.pdf")
+    assert all((tmp_path / name).stat().st_size > 1000 for name in names)

@@ -1,0 +1,196 @@
+"""Predictions: open loop against the inference model, closed loop by hand, what it may look at, and when."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+import beliefrl
+from beliefrl import tasks
+from beliefrl.agents.slac import SLACAgent
+from beliefrl.models import latent_model, variational_model
+from beliefrl.models.nets import Gaussian, draw
+from beliefrl.models.variational_model import VRM
+from beliefrl.types import Step, UserError, perception
+from beliefrl.viewing import prediction
+from worlds import begun, saved, tiny
+
+TASK = tasks.make("pendulum-p", max_steps=12)
+TIME, START, X, ACTION, Z = 7, 4, 3, 1, 4
+
+
+def close(ours, theirs):
+    jax.tree.map(lambda our, their: np.testing.assert_allclose(our, their, rtol=1e-5, atol=1e-6), ours, theirs)
+
+
+def normal(seed, *shape):
+    return jax.random.normal(jax.random.key(seed), shape)
+
+
+def episode():
+    """A made-up one."""
+    is_first = jnp.arange(TIME) == 0
+    reward, prev_action = jnp.where(is_first, 0.0, normal(1, TIME)), normal(2, TIME, ACTION)
+    prev_action = jnp.where(is_first[:, None], 0.0, prev_action)
+    return Step(normal(0, TIME, X - 1), reward, prev_action, is_first, jnp.zeros(TIME, bool))
+
+
+def vrm(deterministic):
+    return jax.jit(lambda key: draw(key, VRM(X, ACTION, 8, Z, 8, deterministic)))(jax.random.key(3))
+
+
+EPISODE, NOISE = episode(), (normal(4, TIME, Z), normal(5, TIME, X))
+INPUTS = perception(EPISODE), EPISODE.prev_action
+ALL, BEFORE = jnp.arange(TIME) >= 0, jnp.arange(TIME) < START
+
+
+@jax.jit
+def predicted_by_hand(model, seen):
+    """The first START moments by the inference model; then, unless all are `seen`, one by one from its own draws."""
+    x, prev_action = INPUTS
+    batched = (leaf[:, None] for leaf in (x, prev_action, EPISODE.is_first, NOISE[0]))
+    inferred = jax.tree.map(lambda leaf: leaf[:, 0], model.infer(model.start(1), *batched))
+    decoded = jax.vmap(model.decode)(inferred.before, inferred.z)
+    state, rows = jax.tree.map(lambda leaf: leaf[START - 1], inferred.state), []
+    for t in range(START, TIME):
+        if model.deterministic:  # z knows no x
+            moment = jnp.zeros(X), prev_action[t], jnp.array(False), jnp.zeros(Z)
+            start = jax.tree.map(lambda leaf: leaf[None], state)
+            z = model.infer(start, *(leaf[None, None] for leaf in moment)).z[0, 0]
+        else:
+            prior = model.prior(state.d, prev_action[t])
+            z = prior.mean + prior.sigma * NOISE[0][t]
+        rows.append(model.decode(state.d, z))
+        draw = rows[-1].mean + (0.0 if model.deterministic else rows[-1].sigma) * NOISE[1][t]
+        state = model.next_state(state, draw, z)
+    alone = jax.tree.map(lambda known, *own: jnp.stack([*known[:START], *own]), decoded, *rows)
+    mean, sigma = jax.tree.map(lambda all_seen, own: jnp.where(seen.all(), all_seen, own), decoded, alone)
+    return Gaussian(mean, jnp.zeros_like(sigma) if model.deterministic else sigma)
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_the_open_loop_decodes_the_posterior_and_the_closed_loop_goes_on_from_its_own_draws(deterministic):
+    model = vrm(deterministic)
+    ask = jax.jit(lambda model, seen: variational_model.predict(model, *INPUTS, seen, NOISE))
+    for seen in (ALL, BEFORE):
+        close(ask(model, seen), predicted_by_hand(model, seen))
+    assert not np.allclose(ask(model, ALL).mean[START:], ask(model, BEFORE).mean[START:])
+
+
+def test_slacs_open_loop_is_what_is_decoded_from_the_posterior():
+    model = begun("slac", TASK.spec, jax.random.key(3)).model
+    noise = normal(4, TIME, 2), normal(5, TIME, 4)
+
+    @jax.jit
+    def both(model):
+        batched = (leaf[:, None] for leaf in (*INPUTS, EPISODE.is_first))
+        latents = model.infer(*batched, tuple(leaf[:, None] for leaf in noise))
+        z1, z2 = latents.z1[:, 0], latents.z2[:, 0]
+        reward = model.reward(z1[:-1], z2[:-1], INPUTS[1][1:], z1[1:], z2[1:])
+        return latent_model.predict(model, *INPUTS, ALL, noise), model.decoder(z1, z2), reward
+
+    (mean, sigma), obs, reward = both(model)
+    close(Gaussian(mean[:, :-1], sigma[:, :-1]), obs)
+    close(Gaussian(mean[1:, -1:], sigma[1:, -1:]), reward)
+    assert np.isnan(mean[0, -1])
+
+
+ASKED = [("vrm", "first"), ("vrm-deterministic", "keep"), ("slac", "latent")]
+
+
+@pytest.mark.parametrize(("name", "model"), ASKED)
+def test_the_closed_loop_sees_nothing_from_its_start_on_but_actions(name, model):
+    agent = tiny(name)
+    state, key = begun(name, TASK.spec, jax.random.key(0)), jax.random.key(1)
+    ask = jax.jit(lambda steps, seen: agent.predict(state, model, steps, seen, key))
+    blind = EPISODE._replace(
+        obs=jnp.where(BEFORE[:, None], EPISODE.obs, jnp.nan), reward=jnp.where(BEFORE, EPISODE.reward, jnp.nan)
+    )
+    closed = ask(EPISODE, BEFORE)
+    close(ask(blind, BEFORE), closed)
+    still = EPISODE._replace(prev_action=jnp.where(BEFORE[:, None], EPISODE.prev_action, 0.0))
+    assert not np.allclose(ask(still, BEFORE).mean[START:], closed.mean[START:])
+    opened = ask(EPISODE, ALL)
+    close(*(jax.tree.map(lambda leaf: leaf[:START], loop) for loop in (opened, closed)))
+    assert not np.allclose(opened.mean[START + 1 :], closed.mean[START + 1 :])
+
+
+class Dice:
+    """Predicts one of many numbers, as its key has it, with σ = 2."""
+
+    def predict(self, state, model, steps, seen, key):
+        mean = jnp.full((3, 2), jax.random.normal(key, ()))
+        return Gaussian(mean, jnp.full((3, 2), 2.0))
+
+
+def test_many_draws_are_one_mixture():
+    drawn = [float(jax.random.normal(key, ())) for key in jax.random.split(jax.random.key(7), 50)]
+    mean, sigma = prediction.predict(Dice(), (), "", EPISODE, ALL, 50, jax.random.key(7))
+    np.testing.assert_allclose(mean, np.full((3, 2), np.mean(drawn)), rtol=1e-5)
+    np.testing.assert_allclose(sigma, np.full((3, 2), np.sqrt(4.0 + np.var(drawn))), rtol=1e-5)
+
+
+def few(run, **changes):
+    return beliefrl.predictions(run, **{"samples": 2, "start": 3, "horizon": 4} | changes)
+
+
+def test_a_prediction_stands_beside_the_truth_of_its_time(tmp_path, monkeypatch):
+    """A model that copies what it sees makes no error in the open loop, and in the closed one only after `start`."""
+
+    def copy(self, state, model, step, seen, key):
+        x = perception(step)
+        return Gaussian(jnp.where(seen[:, None], x, x + 2.0), jnp.zeros_like(x))
+
+    monkeypatch.setattr(SLACAgent, "predict", copy)
+    run = saved(tmp_path / "run", "slac", TASK)
+    predicted = few(run)
+    played = perception(beliefrl.play(run).steps)
+    np.testing.assert_allclose(predicted.truth, played[:7])
+    np.testing.assert_allclose(predicted.open_loop.mean, predicted.truth)
+    np.testing.assert_allclose(
+        predicted.closed_loop.mean - predicted.truth, np.repeat([0.0, 2.0], (9, 12)).reshape(7, 3)
+    )
+    opened, closed = predicted.errors()
+    assert opened.tolist() == [0.0] * 3
+    np.testing.assert_allclose(closed, 2.0)
+    assert predicted.entries == (0, 1)
+    assert predicted.title == "slac on pendulum-p, seed 4: latent model"
+
+
+def test_a_short_episode_is_seen_to_its_half(tmp_path):
+    predicted = few(saved(tmp_path / "run", "vrm-keep", TASK), start=None, horizon=100)
+    assert predicted.start == 6
+    assert predicted.truth.shape == (13, 3)
+    assert all(np.isfinite(leaf).all() for leaf in (*predicted.open_loop, *predicted.closed_loop))
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "sentence"),
+    [
+        ("sac-mlp", {}, "is of sac-mlp, which has no model to predict with"),
+        ("sac-lstm", {}, "is of sac-lstm, which has no model"),
+        ("vrm-keep", {"model": "first"}, "vrm-keep has no model 'first': it has keep"),
+        ("slac", {"model": "keep"}, "slac has no model 'keep': it has latent"),
+        ("slac", {"start": 13}, "start=13 is impossible: the episode has 13 moments, so give 12 or less"),
+    ],
+)
+def test_what_cannot_be_predicted_is_told_in_a_sentence(tmp_path, name, changes, sentence):
+    run = saved(tmp_path / "run", name, TASK)
+    with pytest.raises(UserError, match=sentence):
+        few(run, **changes)
+
+
+def test_the_figure_has_a_row_for_each_entry_that_is_asked_for(tmp_path):
+    predicted = few(saved(tmp_path / "run", "slac", tasks.make("pendulum", (2, 0), max_steps=12)))
+    assert predicted.entries == (2, 0)
+    heights = {}
+    for entries in ((2, 0), (0,), None):
+        path = prediction.draw_predictions(predicted, tmp_path / "picture", entries)
+        assert path == tmp_path / "picture.png"
+        with Image.open(path) as image:
+            heights[entries] = image.height
+        assert (tmp_path / "picture.pdf").read_bytes().startswith(b"%PDF")
+    assert heights[None] == heights[2, 0] > heights[0,]
+    with pytest.raises(UserError, match="entries=1 is impossible: the agent sees 2, 0 of the observation"):
+        prediction.draw_predictions(predicted, tmp_path / "picture", (1,))
