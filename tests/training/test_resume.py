@@ -297,7 +297,7 @@ def test_constants_that_are_tuples_are_the_same_when_a_run_goes_on(tmp_path, mon
     for _ in range(2):
         main(line.split())
     with pytest.raises(SystemExit):
-        main(line.replace("max_steps=2", "max_steps=2 rewards=[1,2,3]").split())
+        main(line.replace("max_steps=2", "max_steps=2 rewards=[1.0,2.0,3.0]").split())
     assert "run was trained with constants=" in capsys.readouterr().err
 
 
