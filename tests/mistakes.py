@@ -85,6 +85,7 @@ MISTAKES = {
     "figure curve": "There is no figure 'curve'",
     "figure curves": "RUNS is missing",
     "figure curves missing": "no folder missing",
+    "figure curves missing.json.gz": "no file missing.json.gz",
     "figure curves there": "no run in there",
     "figure curves untrained": "is finished",
     "figure curves untrained --unfinished": "no curve to draw",
