@@ -232,7 +232,7 @@ def _check_finite(array: np.ndarray, name: str) -> None:
 
 
 def _place(name: str, index: tuple[int, ...]) -> str:
-    """An entry of obs or reward in words: `index` is (entry,) or (episode, entry) of obs, () or (episode,) of reward."""
+    """A number of an input in words: `index` is (entry,) or (episode, entry) of obs, () or (episode,) of reward."""
     *episode, entry = index if name == "obs" and index else (*index, None)
     which = name if entry is None else f"entry {entry} of {name}"
     return f"{which} of episode {episode[0]}" if episode else which

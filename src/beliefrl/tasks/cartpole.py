@@ -39,6 +39,7 @@ class CartPole:
     max_theta: float = math.radians(12.0)  # rad; likewise
     max_steps: int = 1000
 
+    entry_names: ClassVar[tuple[str, ...]] = ("x (m)", "ẋ (m/s)", "θ (rad)", "θ̇ (rad/s)")
     VELOCITIES: ClassVar[tuple[int, ...]] = (1, 3)
     POSITIONS: ClassVar[tuple[int, ...]] = (0, 2)
 

@@ -34,6 +34,7 @@ class Pendulum:
     dt: float = 0.05  # s
     max_steps: int = 200
 
+    entry_names: ClassVar[tuple[str, ...]] = ("cos θ", "sin θ", "θ̇ (rad/s)")
     VELOCITIES: ClassVar[tuple[int, ...]] = (2,)
     POSITIONS: ClassVar[tuple[int, ...]] = (0, 1)
 

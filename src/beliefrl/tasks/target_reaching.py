@@ -9,7 +9,7 @@ the one that is due: what it has reached already it must remember.
 
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -49,6 +49,12 @@ class TargetReaching:
     wall_reward: float = -0.1
     scale: float = 3.0  # distances d are seen as exp(-d / scale)
     max_steps: int = 128
+
+    entry_names: ClassVar[tuple[str, ...]] = (
+        *(f"nearness of {what}" for what in ("red", "green", "blue", "wall ahead", "wall behind")),
+        *(f"{part} of bearing to {colour}" for part in ("sin", "cos") for colour in ("red", "green", "blue")),
+        "last reward",
+    )
 
     @property
     def spec(self) -> Spec:
