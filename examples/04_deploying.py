@@ -4,8 +4,9 @@
     beliefrl train vrm gym:Pendulum-v1 --observe 2 --steps 10000 --out runs/pendulum
     python examples/04_deploying.py runs/pendulum
 
-Numpy goes in and comes out. What was recurrent in training is the `state`: give back what you were given, and say where
-an episode starts. The reward of the last step is an input, as beliefs are formed of it too.
+Numpy goes in and comes out. The recurrent memory is the `state`: pass it to the next call, and say where an episode
+starts. The reward of the last step is an input, as beliefs are formed of it too. A reading that is not a finite number
+is a `beliefrl.UserError` that names the entry; the state is as it was, so a control loop can continue from it.
 """
 
 import pathlib
@@ -21,6 +22,7 @@ import beliefrl
 def main(run: tyro.conf.Positional[str], episodes: int = 3) -> None:
     """Play in the environment that the run was trained on; then export, load, and play again."""
     policy = beliefrl.load(run)
+    print(policy)  # agent, task, sizes, seed
     task = beliefrl.task_of(run)
     environment = task.environment()  # as the agent saw it: its entries of the observation, actions in [-1, 1]
     totals = []

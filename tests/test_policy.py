@@ -100,6 +100,8 @@ def test_samples_differ_and_come_back_with_their_seed():
         ({"obs": [[0.0, 0.0], [0.0]]}, "obs must be real numbers"),
         ({"obs": [0.0, 0.0], "reward": "1"}, "reward must be real numbers, not '1'"),
         ({"obs": [0.0, 0.0], "reward": (np.zeros((1, 1)), np.zeros((1, 2)))}, "reward must be real numbers"),
+        ({"obs": (np.zeros((1, 8)), np.zeros((1, 9)), np.zeros((1, 9)))}, "obs must be real numbers, not a tuple"),
+        ({"obs": [0.0, 0.0], "episode_start": [[1, 0], [1]]}, r"episode_start must be True or False, not \[\[1, 0"),
         ({"obs": [0.0, 0.0], "episode_start": "no"}, "episode_start must be True or False, not 'no'"),
         ({"obs": [0.0, 0.0], "deterministic": 2}, "deterministic must be True or False, not 2"),
     ],
@@ -166,8 +168,11 @@ def test_what_is_no_path_is_no_run(wrong):
 
 
 def test_an_export_that_cannot_be_written_is_one_sentence(tmp_path):
-    with pytest.raises(UserError, match=r"policy.jax cannot be written \(No such file or directory\)"):
-        Policy(*_with_spec("sac-mlp")).export(tmp_path / "missing" / "policy.jax")
+    policy = Policy(*_with_spec("sac-mlp"))
+    with pytest.raises(UserError, match=r"policy.jax cannot be written \(there is no folder .*missing\)"):
+        policy.export(tmp_path / "missing" / "policy.jax")
+    with pytest.raises(UserError, match=r"cannot be written \(it is a folder\)"):
+        policy.export("")
 
 
 ALONE = """

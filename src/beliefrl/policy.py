@@ -20,6 +20,7 @@ import numpy as np
 
 from beliefrl import agents
 from beliefrl.agents import Agent
+from beliefrl.analysis.figures import check_folder
 from beliefrl.runs.arrays import write_whole
 from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
@@ -161,6 +162,8 @@ class Policy:
         Raises:
             UserError: the file cannot be written.
         """
+        path = pathlib.Path(path)
+        check_folder(path)
         (batch,) = jax.export.symbolic_shape("batch")
 
         def shaped(shape: tuple[Any, ...], kind: Any) -> jax.ShapeDtypeStruct:
@@ -171,7 +174,7 @@ class Policy:
         rest = shaped((batch,), jnp.bool_), shaped((), jnp.uint32), shaped((), jnp.bool_)
         exported = jax.export.export(self._act, platforms=("cpu", "cuda"))(*numbers, state, *rest)
         try:
-            write_whole(pathlib.Path(path), bytes(exported.serialize()))
+            write_whole(path, bytes(exported.serialize()))
         except OSError as error:
             raise UserError(f"{path} cannot be written ({error.strerror}): choose another file.") from None
 
@@ -201,10 +204,7 @@ def _numbers(value: Any, name: str) -> np.ndarray:
     Raises:
         UserError: something in it is no number.
     """
-    try:
-        array = np.asarray(value)
-    except Exception:  # rows of different lengths, or whatever a stranger's class may raise
-        array = np.empty(0, object)
+    array = _array(value)
     for index, entry in np.ndenumerate(array if array.dtype == object else ()):
         if not isinstance(entry, Real):
             raise UserError(f"{_place(name, index)} is {short(entry)}: give finite numbers.")
@@ -213,9 +213,17 @@ def _numbers(value: Any, name: str) -> np.ndarray:
     return array
 
 
+def _array(value: Any) -> np.ndarray:
+    """Any value as an array; one of no entries where it is none."""
+    try:
+        return np.asarray(value)
+    except Exception:  # rows of different lengths, or whatever a stranger's class may raise
+        return np.empty(0, object)
+
+
 def _flags(value: Any, batch: int, name: str) -> np.ndarray:
     """True or False for each episode of a batch."""
-    array = np.asarray(value)
+    array = _array(value)
     if array.dtype.kind not in "biu" or not np.isin(array, (0, 1)).all():
         raise UserError(f"{name} must be True or False, not {short(value)}.")
     return _each(array.astype(bool), batch, name)

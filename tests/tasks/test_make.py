@@ -8,10 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from beliefrl.tasks import TASKS, make, names, observe
+from beliefrl.tasks import TASKS, entry_names, make, names, observe
+from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.pendulum import Pendulum
 from beliefrl.tasks.target_reaching import TargetReaching
 from beliefrl.types import UserError
+from worlds import Counter, Counting
 
 SIZES = {  # obs_dim, action_dim, max_steps, has_success
     "pendulum": (3, 1, 200, False),
@@ -56,6 +58,29 @@ def test_observe_keeps_the_order_that_was_asked_for():
     obs, seen = jax.jit(lambda key: (task.reset(key)[1], some.reset(key)[1]))(KEYS[0])
     np.testing.assert_array_equal(seen, obs[jnp.array([11, 0, 4])])
     assert some.spec == task.spec._replace(obs_dim=3)
+
+
+def test_every_entry_that_is_seen_has_the_tasks_name_for_it():
+    for name, (size, *_) in SIZES.items():
+        assert len(set(entry_names(make(name)))) == size
+    assert entry_names(make("cartpole-v")) == ("ẋ (m/s)", "θ̇ (rad/s)")
+    assert entry_names(observe(make("pendulum", (2, 0)), (1,))) == ("cos θ",)
+    order = ("nearness of red", "nearness of wall ahead", "sin of bearing to red", "cos of bearing to blue")
+    assert entry_names(make("target-reaching", (0, 3, 5, 10))) == order
+
+
+def test_entries_without_a_name_have_their_index_in_the_full_observation():
+    assert entry_names(observe(GymnasiumTask(Counter), (1,))) == ("entry 1",)
+    assert entry_names(Counting()) == ("entry 0",)
+
+
+class Misnamed(Counting):
+    entry_names = ("count", "another")
+
+
+def test_names_that_do_not_fit_the_observation_are_one_sentence():
+    with pytest.raises(UserError, match="Misnamed has 2 entry_names for an observation of 1: give one name for each"):
+        entry_names(Misnamed())
 
 
 @pytest.mark.parametrize("indices", [(), (3,), (0, -1), (1.5,), (True,), ("1",), (10**30,)])

@@ -110,6 +110,13 @@ def test_a_strip_is_evenly_spaced_from_the_first_moment_to_the_last(run):
     assert list(films._strip(run, 8, None, 0, False, 3, None).frames) == [0, 1, 2, 3]
 
 
+def test_a_strip_says_that_the_numbers_below_its_frames_are_steps(run, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(films.figures, "save", lambda figure, path: drawn.append(figure) or path)
+    films.film([run], frames=3)
+    assert [text.get_text() for text in drawn[0].texts][1:] == ["step 0", "step 2", "step 5"]
+
+
 def test_a_strip_has_a_row_for_each_run(tmp_path, run):
     other = saved(tmp_path / "other", "sac-mlp", TASK)
     heights = []

@@ -9,6 +9,7 @@ from PIL import Image
 import beliefrl
 from beliefrl import tasks
 from beliefrl.agents.slac import SLACAgent
+from beliefrl.analysis import figures
 from beliefrl.models import latent_model, variational_model
 from beliefrl.models.nets import Gaussian, draw
 from beliefrl.models.variational_model import VRM
@@ -194,3 +195,18 @@ def test_the_figure_has_a_row_for_each_entry_that_is_asked_for(tmp_path):
     assert heights[None] == heights[2, 0] > heights[0,]
     with pytest.raises(UserError, match="entries=1 is impossible: the agent sees 2, 0 of the observation"):
         prediction.draw_predictions(predicted, tmp_path / "picture", (1,))
+
+
+def test_rows_have_the_names_of_what_they_show_and_time_is_in_steps(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(figures, "save", lambda figure, path: drawn.append(figure) or path)
+    predicted = few(saved(tmp_path / "run", "slac", tasks.make("pendulum", (2, 0), max_steps=12)))
+    assert predicted.names == ("θ̇ (rad/s)", "cos θ", "reward")
+    prediction.draw_predictions(predicted, tmp_path / "picture")
+    prediction.draw_predictions(
+        predicted._replace(names=("entry 7", "a name of many words", "reward")), tmp_path / "picture", (0,)
+    )
+    whole, part = ([axis.get_ylabel() for axis in figure.axes] for figure in drawn)
+    assert whole == ["θ̇ (rad/s)", "cos θ", "reward"]
+    assert part == ["a name of many\nwords", "reward"]
+    assert [axis.get_xlabel() for axis in drawn[0].axes] == ["", "", "step"]

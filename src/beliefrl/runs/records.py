@@ -133,13 +133,7 @@ def is_summary(results: Any, seeds: int) -> bool:
         return True
     if not isinstance(results, dict) or not _is_step(results.get("step")):
         return False
-<<<<<<< HEAD:src/beliefrl/runs/records.py
-    sampled: Any = results.get("sampled")
-    mode: Any = results.get("mode")
-    if not (_is_mode(sampled, seeds) and _is_mode(mode, seeds)):
-=======
     if not all(_is_mode(results.get(mode), seeds) for mode in ("sampled", "mode")):
->>>>>>> g-runs:src/beliefrl/records.py
         return False
     return (results["sampled"]["success"] is None) == (results["mode"]["success"] is None)
 

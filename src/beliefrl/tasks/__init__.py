@@ -21,7 +21,8 @@ class Task(Protocol):
     """A frozen dataclass of physical constants with pure methods; no time limit and no reset of its own.
 
     `rollout` cuts episodes at `spec.max_steps` and resets them. A task that can be seen also has `draw(states)`, the
-    `drawing.Picture` of an episode's states so far.
+    `drawing.Picture` of an episode's states so far. A task may have `entry_names`, a tuple with the name of each entry
+    of its observation and the unit in brackets, as figures show them: ("cos θ", "sin θ", "θ̇ (rad/s)").
     """
 
     @property
@@ -93,6 +94,24 @@ def entries(task: Any) -> tuple[int, ...]:
         return tuple(inner[i] for i in task.indices)
     indices = getattr(task, "indices", None)
     return tuple(range(task.spec.obs_dim)) if indices is None else tuple(indices)
+
+
+def entry_names(task: Any) -> tuple[str, ...]:
+    """What figures call each entry that the agent sees: the task's own name, or "entry 2" of its full observation.
+
+    Raises:
+        UserError: the task has more or fewer names than entries.
+    """
+    if isinstance(task, Observed):
+        inner = entry_names(task.task)
+        return tuple(inner[i] for i in task.indices)
+    names = getattr(task, "entry_names", None) or [f"entry {i}" for i in entries(task)]
+    if len(names) != task.spec.obs_dim:
+        raise UserError(
+            f"{type(task).__name__} has {len(names)} entry_names for an observation of {task.spec.obs_dim}: give one "
+            "name for each entry."
+        )
+    return tuple(names)
 
 
 TASKS: dict[str, type[Any]] = {

@@ -50,6 +50,7 @@ class CartPole:
     max_steps: int = 1000
     """Time limit in steps."""
 
+    entry_names: ClassVar[tuple[str, ...]] = ("x (m)", "ẋ (m/s)", "θ (rad)", "θ̇ (rad/s)")
     VELOCITIES: ClassVar[tuple[int, ...]] = (1, 3)
     POSITIONS: ClassVar[tuple[int, ...]] = (0, 2)
 

@@ -41,6 +41,7 @@ class Pendulum:
     max_steps: int = 200
     """Time limit in steps."""
 
+    entry_names: ClassVar[tuple[str, ...]] = ("cos θ", "sin θ", "θ̇ (rad/s)")
     VELOCITIES: ClassVar[tuple[int, ...]] = (2,)
     POSITIONS: ClassVar[tuple[int, ...]] = (0, 1)
 

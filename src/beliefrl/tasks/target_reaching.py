@@ -9,7 +9,7 @@ the one that is due: what it has reached already it must remember.
 
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -67,6 +67,12 @@ class TargetReaching:
         check_range(self, ("min_squared_gap",), 0, self.target_square**2 / 2)  # else targets are redrawn for ever
         check_range(self, ("rewards", "wall_reward"), -1000, 1000)
         check_range(self, ("max_steps",), 1)
+
+    entry_names: ClassVar[tuple[str, ...]] = (
+        *(f"nearness of {what}" for what in ("red", "green", "blue", "wall ahead", "wall behind")),
+        *(f"{part} of bearing to {colour}" for part in ("sin", "cos") for colour in ("red", "green", "blue")),
+        "last reward",
+    )
 
     @property
     def spec(self) -> Spec:

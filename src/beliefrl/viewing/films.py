@@ -196,7 +196,7 @@ def film(
 ) -> pathlib.Path:
     """Draw a film strip: a row for each run, of one episode's frames, evenly spaced, from its first moment to its last.
 
-    Writes a PNG and a PDF, returns the first.
+    Below each frame is its step. Writes a PNG and a PDF, returns the first.
 
     Args:
         runs: runs, or their folders.
@@ -251,6 +251,6 @@ def _draw_strips(runs: Sequence[Run], rows: Sequence[Trajectory]) -> Any:
             axis = figure.add_axes(place)
             axis.imshow(pixels)
             axis.set_axis_off()
-            figure.text((left + side / 2 - gap) / width, (low - 0.14) / height, f"{time}", ha="center", fontsize=8)
+            figure.text((left + side / 2 - gap) / width, (low - 0.14) / height, f"step {time}", ha="center", fontsize=8)
         top = low - below
     return figure

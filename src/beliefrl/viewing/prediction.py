@@ -11,6 +11,7 @@ Each is the mean of many draws. σ is that of the mixture they are: σ² = mean 
 
 import os
 import pathlib
+import textwrap
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -40,6 +41,7 @@ class Predictions(NamedTuple):
 
     title: str
     entries: tuple[int, ...]  # of the task's full observation: what x is of, but for the reward
+    names: tuple[str, ...]  # of the columns of x: the task's names of the entries, or "entry 2"; then "reward"
     start: int  # the first moment that the closed loop does not see
     truth: Float[np.ndarray, "time x"]
     open_loop: Gaussian  # leaves (time, x); NaN where nothing is predicted; σ = 0 of a deterministic model
@@ -115,7 +117,9 @@ def predictions(
         loops = [compiled(state, name, steps, seen, samples, key) for seen in (time >= 0, time < start)]
     seed = run.seeds[0] if seed is None else seed
     title = f"{run.config['agent']} on {run.config['task']}, seed {seed}: {name} model"
-    return Predictions(title, tasks.entries(found), start, np.asarray(perception(steps)), *jax.device_get(loops))
+    names = (*tasks.entry_names(found), "reward")
+    truth, loops = np.asarray(perception(steps)), jax.device_get(tuple(loops))
+    return Predictions(title, tasks.entries(found), names, start, truth, *loops)
 
 
 def _check_sizes(start: int | None, horizon: int, samples: int) -> None:
@@ -141,6 +145,7 @@ def draw_predictions(
 ) -> pathlib.Path:
     """Draw predictions beside the truth, a row for each entry of the observation and one for the reward.
 
+    A row has the task's name of the entry and its unit, or "entry 2", its index in the full observation.
     Bands are ± σ, and the numbers root mean squared errors from `start` on. Writes a PNG and a PDF, returns the first.
 
     Args:
@@ -158,12 +163,13 @@ def draw_predictions(
         if entry not in predicted.entries:
             seen = ", ".join(map(str, predicted.entries))
             raise UserError(f"entries={entry} is impossible: the agent sees {seen} of the observation.")
-    rows = {f"observation {entry}": predicted.entries.index(entry) for entry in entries} | {"reward": -1}
+    rows = [*(predicted.entries.index(entry) for entry in entries), len(predicted.entries)]
     figure = figures.figure(8.0, 1.0 + 1.3 * len(rows))
     axes = figure.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
-    for axis, (label, index) in zip(axes, rows.items(), strict=True):
+    for axis, index in zip(axes, rows, strict=True):
         _draw_row(axis, predicted, index)
-        axis.set_ylabel(label)
+        axis.set_ylabel(textwrap.fill(predicted.names[index], 15))  # what a row is high enough for
+    figure.align_ylabels(axes)
     figure.suptitle(predicted.title, x=0.01, ha="left", fontsize=10)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=3, frameon=False, fontsize=8)
     axes[-1].set_xlabel("step")
