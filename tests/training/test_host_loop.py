@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium import spaces
-from test_phases import MODELS, SEQUENCES, SHARED, leaves, trained
 
 from beliefrl import agents, evaluate, load, tasks, train
 from beliefrl.runs.run import Run
@@ -18,6 +17,7 @@ from beliefrl.tasks.pendulum import Pendulum, PendulumState
 from beliefrl.training import host_loop, phases
 from beliefrl.training.lockstep import Lockstep
 from beliefrl.types import UserError
+from small import MODELS, SEQUENCES, SHARED, leaves, trained
 from worlds import Counting, CountingAgent
 from wrong import Fine, Killed, Raising
 

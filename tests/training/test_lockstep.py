@@ -5,13 +5,13 @@ import time
 
 import numpy as np
 import pytest
-from test_phases import SHARED
 
 from beliefrl import UserError, agents, train
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import lockstep
 from beliefrl.training.lockstep import Lockstep
 from beliefrl.training.schedule import Options, stages
+from small import SHARED
 from wrong import Fine, raising
 
 

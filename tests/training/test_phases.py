@@ -7,11 +7,9 @@ import pytest
 
 from beliefrl import agents, tasks
 from beliefrl.training import phases
+from small import MODELS, SEQUENCES, SHARED, leaves, trained
 from worlds import Counting, CountingAgent
 
-SHARED = {"step_start_rl": 20, "policy_layers": (8,), "value_layers": (8,)}
-MODELS = {"train_times_fivrm": 10, "d_size": 8, "z_size": 4, "hidden_size": 8}
-SEQUENCES = {"seq_len": 8, "burn_in": 4, "batch_size": 2}
 SMALL = {
     "vrm": MODELS | SEQUENCES | {"standardise": True},
     "vrm-single": MODELS | SEQUENCES,
@@ -19,21 +17,6 @@ SMALL = {
     "sac-lstm": {"d_size": 8, "pretrain_updates": 10} | SEQUENCES,
     "slac": {"z1_size": 2, "z2_size": 4, "model_layers": (8,), "batch_size": 2, "pretrain_updates": 10},
 }
-
-
-def trained(program, keys, cuts=(10, 10), learn=(10, 15), cycle=5):
-    """Explore, pre-train, relive and learn, in stretches of these lengths."""
-    seeds, step, told = program.begin(keys), 0, []
-    for steps in cuts:
-        seeds, stretch = program.explore(seeds, step, steps)
-        step += steps
-    seeds, _ = program.pretrain(seeds, 0, 10)
-    seeds = program.relive(seeds)
-    for steps in learn:
-        seeds, stretch = program.learn(seeds, step, steps // cycle)
-        told.append(jax.tree.map(np.asarray, stretch))
-        step += steps
-    return seeds, told
 
 
 @pytest.fixture(
@@ -44,13 +27,6 @@ def small(request):
     """A small agent's training program and its agent's cycle."""
     agent, task = agents.make(request.param, **SHARED, **SMALL[request.param]), tasks.make("pendulum-p", max_steps=9)
     return phases.compile_program(agent, task, capacity=200, episodes=2), agent.cycle
-
-
-def leaves(tree):
-    return [
-        np.asarray(jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x)
-        for x in jax.tree.leaves(tree)
-    ]
 
 
 @pytest.fixture
