@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Key
 import beliefrl
 from beliefrl.agents.sac import SAC, Metrics
 from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState
-from beliefrl.types import Spec, Step, Window, WindowShape, transitions
+from beliefrl.types import Spec, Timestep, Window, WindowShape, transitions
 
 
 class State(NamedTuple):
@@ -72,7 +72,12 @@ class StackAgent(SAC):
         return jnp.zeros((self.stack, spec.obs_dim))
 
     def act(
-        self, state: State, memory: Float[Array, "stack obs"], step: Step, key: Key[Array, ""], explore: Bool[Array, ""]
+        self,
+        state: State,
+        memory: Float[Array, "stack obs"],
+        step: Timestep,
+        key: Key[Array, ""],
+        explore: Bool[Array, ""],
     ) -> tuple[Float[Array, " action"], Float[Array, "stack obs"]]:
         """Perceive a moment, and act on it."""
         older = jnp.where(step.is_first, jnp.broadcast_to(step.obs, memory.shape), memory)

@@ -10,13 +10,13 @@ SEQUENCES = {"seq_len": 8, "burn_in": 4, "batch_size": 2}
 
 
 def trained(program, keys, cuts=(10, 10), learn=(10, 15), cycle=5):
-    """Explore, pre-train, relive and learn, in stretches of these lengths."""
+    """Explore, pre-train, refresh and learn, in stretches of these lengths."""
     seeds, step, told = program.begin(keys), 0, []
     for steps in cuts:
         seeds, stretch = program.explore(seeds, step, steps)
         step += steps
     seeds, _ = program.pretrain(seeds, 0, 10)
-    seeds = program.relive(seeds)
+    seeds = program.refresh(seeds)
     for steps in learn:
         seeds, stretch = program.learn(seeds, step, steps // cycle)
         told.append(jax.tree.map(np.asarray, stretch))

@@ -96,7 +96,7 @@ class Counting:
 
 
 class CountingState(NamedTuple):
-    offset: Any  # what `relive` can see changing
+    offset: Any  # what `refresh` can see changing
     seen: Any  # transitions that were checked
 
 

@@ -27,7 +27,7 @@ from beliefrl.training.evaluation import evaluate, task_of
 from beliefrl.training.schedule import Event
 from beliefrl.training.stop import Stopped
 from beliefrl.training.train import resume, train
-from beliefrl.types import Moment, Spec, Step, UserError, Window, WindowShape
+from beliefrl.types import Spec, StoredTimestep, Timestep, UserError, Window, WindowShape
 from beliefrl.viewing.episodes import Trajectory, play
 from beliefrl.viewing.films import film, video
 from beliefrl.viewing.prediction import Predictions, draw_predictions, predictions
@@ -40,17 +40,17 @@ __all__ = [
     "Event",
     "Experiment",
     "GymnasiumTask",
-    "Moment",
     "Options",
     "Policy",
     "Predictions",
     "Run",
     "Spec",
-    "Step",
     "Stopped",
+    "StoredTimestep",
     "SweepStatus",
     "Task",
     "TaskEnvironment",
+    "Timestep",
     "Trajectory",
     "UserError",
     "Window",

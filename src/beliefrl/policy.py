@@ -26,7 +26,7 @@ from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.evaluation import restore_seed
-from beliefrl.types import LARGEST, Spec, Step, UserError, short
+from beliefrl.types import LARGEST, Spec, Timestep, UserError, short
 
 State = tuple[np.ndarray, ...]
 
@@ -57,7 +57,7 @@ class Policy:
         *memory, prev_action = state
         memory = jax.tree.structure(self._empty).unflatten(memory)
         memory = jax.tree.map(functools.partial(_where_first, episode_start), self._empty, memory)
-        step = Step(
+        step = Timestep(
             obs=obs,
             reward=jnp.where(episode_start, 0.0, reward),
             prev_action=jnp.where(episode_start[:, None], 0.0, prev_action),

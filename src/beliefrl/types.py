@@ -106,7 +106,7 @@ class Spec(NamedTuple):
     has_success: bool = False  # whether an episode can succeed, besides its return
 
 
-class Step(NamedTuple):
+class Timestep(NamedTuple):
     """One moment: what is perceived at t, and what was done just before it.
 
     Two neighbouring moments are a transition (o_t, a_t, r_t, o_{t+1}) unless the second is_first:
@@ -120,22 +120,22 @@ class Step(NamedTuple):
     terminated: Bool[Array, "*batch"]  # o_t is terminal: there is no value beyond it
 
 
-def perception(step: Step) -> Float[Array, "*batch x"]:
+def perception(step: Timestep) -> Float[Array, "*batch x"]:
     """x_t = (o_t, r_{t-1})."""
     return jnp.concatenate([step.obs, step.reward[..., None]], axis=-1)
 
 
-class Moment(NamedTuple):
+class StoredTimestep(NamedTuple):
     """What the replay keeps of a moment: the step, and the agent's own note of it (any pytree, may be empty)."""
 
-    step: Step
+    step: Timestep
     note: Any
 
 
 class Window(NamedTuple):
     """Moments in a row as the replay returns them; is_first is also set at the oldest moment that exists."""
 
-    step: Step  # leaves (batch, time, ...)
+    step: Timestep  # leaves (batch, time, ...)
     note: Any
     exists: Bool[Array, "*batch time"]  # False where the window overhangs what is stored
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from beliefrl.types import Spec, Step, Window
+from beliefrl.types import Spec, Timestep, Window
 
 SPEC = Spec(obs_dim=3, action_dim=2, max_steps=50)
 SMALL = {  # VRM
@@ -25,7 +25,7 @@ def windows(key, batch, time, is_first=None, exists=None):
     none = jnp.zeros((batch, time), bool)
     is_first = none.at[:, 0].set(True) if is_first is None else is_first
     action = jnp.tanh(jax.random.normal(keys[2], (batch, time, SPEC.action_dim)))
-    step = Step(
+    step = Timestep(
         jax.random.normal(keys[0], (batch, time, SPEC.obs_dim)),
         jnp.where(is_first, 0.0, jax.random.normal(keys[1], (batch, time))),
         jnp.where(is_first[..., None], 0.0, action),

@@ -10,7 +10,7 @@ import pytest
 
 from agents.moments import SPEC, differ, windows
 from beliefrl.agents.sac_mlp import SACMLPAgent
-from beliefrl.types import Step, UserError, Window
+from beliefrl.types import Timestep, UserError, Window
 
 GOLDEN = pathlib.Path(__file__).parents[1] / "golden" / "sac.npz"
 AGENT = SACMLPAgent(policy_layers=(8, 8), value_layers=(8, 8), batch_size=6)
@@ -27,7 +27,7 @@ def test_its_transitions_are_those_of_the_golden_update():
     numbers = dict(np.load(GOLDEN))
     moments = [numbers["belief"], numbers["next_belief"]]
     rows, actions = len(numbers["reward"]), numbers["action"].shape[-1]
-    step = Step(
+    step = Timestep(
         obs=jnp.stack(moments, axis=1),
         reward=jnp.stack([jnp.zeros(rows), numbers["reward"]], axis=1),
         prev_action=jnp.stack([jnp.zeros((rows, actions)), numbers["action"]], axis=1),

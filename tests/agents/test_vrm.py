@@ -13,7 +13,7 @@ from beliefrl import agents
 from beliefrl.agents.vrm import VRMAgent
 from beliefrl.models.nets import draw, standardised, unscaled
 from beliefrl.models.variational_model import VRM, Gaussian, Loop, LSTMState, _loop, _scan
-from beliefrl.types import Step, UserError, Window, check_choice, time_major
+from beliefrl.types import Timestep, UserError, Window, check_choice, time_major
 
 AGENT = VRMAgent(**SMALL)
 
@@ -28,7 +28,7 @@ def windows(key, batch, is_first=None, exists=None):
     time = AGENT.burn_in + AGENT.seq_len + 1
     keys = jax.random.split(key, 4)
     none = jnp.zeros((batch, time), bool)
-    step = Step(
+    step = Timestep(
         jax.random.normal(keys[0], (batch, time, SPEC.obs_dim)),
         jax.random.normal(keys[1], (batch, time)),
         jnp.tanh(jax.random.normal(keys[2], (batch, time, SPEC.action_dim))),

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from agents.moments import SMALL, SPEC, windows
 from beliefrl import agents
 from beliefrl.models.returns import n_step_returns, transition_batch
-from beliefrl.types import Step
+from beliefrl.types import Timestep
 
 GAMMA = 0.9
 
@@ -18,7 +18,7 @@ GAMMA = 0.9
 def step_of(rewards, firsts, terminated):
     rewards = jnp.asarray(rewards, float)[:, None]
     moments = len(rewards)
-    return Step(
+    return Timestep(
         jnp.arange(moments, dtype=float)[:, None, None],
         rewards,
         jnp.arange(moments, dtype=float)[:, None, None],

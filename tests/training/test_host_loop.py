@@ -83,7 +83,7 @@ def test_every_window_is_unbroken_in_time():
     seeds, told = program.explore(seeds, 0, 10)
     assert told.episodes.done.sum() == 2  # of seven steps each
     seeds, _ = program.pretrain(seeds, 0, 3)
-    seeds = program.relive(seeds)
+    seeds = program.refresh(seeds)
     seeds, told = program.learn(seeds, 10, 20)
     assert np.all(told.metrics["valid"] > 0)
     assert not np.any(told.metrics["broken"])

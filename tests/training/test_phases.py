@@ -101,7 +101,7 @@ def counting(steps=120, task=None):
     for first in (0, 1):
         seeds, metrics = program.pretrain(seeds, first, 1 + first)
         told.append(metrics)
-    seeds = program.relive(seeds)
+    seeds = program.refresh(seeds)
     step = 10
     for cycles in (1, 3, 5, steps // 4 - 9):
         seeds, stretch = program.learn(seeds, step, cycles)

@@ -91,7 +91,7 @@ def learn(task, steps, seeds=1, **hyperparameters):
     seeds, step = program.begin(keys), agent.step_start_rl
     seeds, _ = program.explore(seeds, 0, step)
     seeds, _ = program.pretrain(seeds, 0, agent.pretrain_updates)
-    seeds = program.relive(seeds)
+    seeds = program.refresh(seeds)
     while step < steps:
         seeds, told = program.learn(seeds, step, 20)
         step += 100

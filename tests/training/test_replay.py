@@ -5,14 +5,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beliefrl.training import replay as ring
-from beliefrl.types import Moment, Step, WindowShape, transitions
+from beliefrl.types import StoredTimestep, Timestep, WindowShape, transitions
 
 
 def moment(number, is_first):
     """A moment that carries its own running number everywhere."""
     value = jnp.asarray(number, float)
-    step = Step(value[None], value, value[None], jnp.asarray(is_first), jnp.array(False))
-    return Moment(step, (value,))
+    step = Timestep(value[None], value, value[None], jnp.asarray(is_first), jnp.array(False))
+    return StoredTimestep(step, (value,))
 
 
 @jax.jit

@@ -81,7 +81,9 @@ def test_reliving_restores_notes_and_memory(steps):
     replay = ring.Replay(blank, jnp.array(moments.step.reward.shape[0]))
     spec = Counting().spec
     state = AGENT.init(jax.random.key(0), spec)
-    again, replay = jax.jit(lambda a, r: rollout.relive(AGENT, spec, state, a, r, jax.random.key(1), 20))(actor, replay)
+    again, replay = jax.jit(lambda a, r: rollout.refresh(AGENT, spec, state, a, r, jax.random.key(1), 20))(
+        actor, replay
+    )
     np.testing.assert_array_equal(replay.moments.note[0][: len(moments.note[0])], moments.note[0])
     assert float(again.memory) == float(actor.memory)
 

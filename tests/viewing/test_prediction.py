@@ -13,7 +13,7 @@ from beliefrl.analysis import figures
 from beliefrl.models import latent_model, variational_model
 from beliefrl.models.nets import Gaussian, draw
 from beliefrl.models.variational_model import VRM
-from beliefrl.types import Step, UserError, perception
+from beliefrl.types import Timestep, UserError, perception
 from beliefrl.viewing import prediction
 from worlds import begun, saved, tiny
 
@@ -34,7 +34,7 @@ def episode():
     is_first = jnp.arange(TIME) == 0
     reward, prev_action = jnp.where(is_first, 0.0, normal(1, TIME)), normal(2, TIME, ACTION)
     prev_action = jnp.where(is_first[:, None], 0.0, prev_action)
-    return Step(normal(0, TIME, X - 1), reward, prev_action, is_first, jnp.zeros(TIME, bool))
+    return Timestep(normal(0, TIME, X - 1), reward, prev_action, is_first, jnp.zeros(TIME, bool))
 
 
 def vrm(deterministic):

@@ -13,7 +13,7 @@ from beliefrl.agents.sac_mlp import SACMLPAgent
 from beliefrl.agents.slac import SLACAgent
 from beliefrl.agents.vrm import VRMAgent
 from beliefrl.models.nets import Gaussian
-from beliefrl.types import Spec, Step, UserError, Window, WindowShape
+from beliefrl.types import Spec, Timestep, UserError, Window, WindowShape
 
 Metrics = dict[str, Float[Array, ""]]
 
@@ -57,7 +57,7 @@ class Agent(Protocol):
         ...
 
     def act(
-        self, state: Any, memory: Any, step: Step, key: Key[Array, ""], explore: Bool[Array, ""]
+        self, state: Any, memory: Any, step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]
     ) -> tuple[Float[Array, " action"], Any]:
         """Perceive a moment; returns the action (a sample, or the mode where not `explore`) and the new memory."""
         ...
@@ -88,7 +88,9 @@ class Predictive(Protocol):
         """The names of its models, the one to be asked by default first."""
         ...
 
-    def predict(self, state: Any, model: str, step: Step, seen: Bool[Array, " time"], key: Key[Array, ""]) -> Gaussian:
+    def predict(
+        self, state: Any, model: str, step: Timestep, seen: Bool[Array, " time"], key: Key[Array, ""]
+    ) -> Gaussian:
         """What one of its models predicts of x_t = (o_t, r_{t-1}) along an episode, leaves (time, x).
 
         Open loop where x_t is `seen`: latent variables are inferred from it. Closed loop where it is not: they are

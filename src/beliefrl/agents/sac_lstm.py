@@ -20,7 +20,7 @@ from beliefrl.agents.sac import SAC, Metrics, for_each_update, split_updates
 from beliefrl.models.nets import LSTM, LSTMState, descend, draw
 from beliefrl.models.returns import transition_batch
 from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState, soft_update, update
-from beliefrl.types import WIDEST, Spec, Step, Window, WindowShape, check_range, time_major, transitions
+from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range, time_major, transitions
 
 
 class State(NamedTuple):
@@ -90,7 +90,7 @@ class SACLSTMAgent(SAC):
 
     # Acting
 
-    def perception(self, step: Step) -> Float[Array, "*batch x"]:
+    def perception(self, step: Timestep) -> Float[Array, "*batch x"]:
         """o_t, with the action and the reward before it where they are perceived."""
         parts = [step.obs]
         if self.perceive_action:
@@ -103,7 +103,7 @@ class SACLSTMAgent(SAC):
         return LSTMState(jnp.zeros(self.d_size), jnp.zeros(self.d_size))
 
     def act(
-        self, state: State, memory: LSTMState, step: Step, key: Key[Array, ""], explore: Bool[Array, ""]
+        self, state: State, memory: LSTMState, step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]
     ) -> tuple[Float[Array, " action"], LSTMState]:
         start = jax.tree.map(lambda leaf: leaf[None], memory)
         after = state.lstm.unroll(start, self.perception(step)[None, None], step.is_first[None, None])

@@ -14,7 +14,7 @@ from beliefrl.agents.sac import SAC, Metrics, for_each_update, standardise_belie
 from beliefrl.models.nets import Scale, standardised, unscaled
 from beliefrl.models.returns import transition_batch
 from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState
-from beliefrl.types import Spec, Step, Window, WindowShape, check_range, time_major, transitions
+from beliefrl.types import Spec, Timestep, Window, WindowShape, check_range, time_major, transitions
 
 
 class State(NamedTuple):
@@ -63,7 +63,7 @@ class SACMLPAgent(SAC):
         return ()
 
     def act(
-        self, state: State, memory: tuple[()], step: Step, key: Key[Array, ""], explore: Bool[Array, ""]
+        self, state: State, memory: tuple[()], step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]
     ) -> tuple[Float[Array, " action"], tuple[()]]:
         return self.choose(state.controller, standardised(state.scale, step.obs), key, explore), memory
 

@@ -26,7 +26,7 @@ from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState,
 from beliefrl.types import (
     WIDEST,
     Spec,
-    Step,
+    Timestep,
     UserError,
     Window,
     WindowShape,
@@ -124,7 +124,12 @@ class SLACAgent(SAC):
         return jnp.zeros((self.history, spec.obs_dim + 1))
 
     def act(
-        self, state: State, memory: Float[Array, "history x"], step: Step, key: Key[Array, ""], explore: Bool[Array, ""]
+        self,
+        state: State,
+        memory: Float[Array, "history x"],
+        step: Timestep,
+        key: Key[Array, ""],
+        explore: Bool[Array, ""],
     ) -> tuple[Float[Array, " action"], Float[Array, "history x"]]:
         x = perception(step)
         memory = jnp.where(step.is_first, x[None], jnp.concatenate([memory[1:], x[None]]))
@@ -140,7 +145,7 @@ class SLACAgent(SAC):
         return ("latent",)
 
     def predict(
-        self, state: State, model: str, step: Step, seen: Bool[Array, " time"], key: Key[Array, ""]
+        self, state: State, model: str, step: Timestep, seen: Bool[Array, " time"], key: Key[Array, ""]
     ) -> Gaussian:
         key1, key2 = jax.random.split(key)
         time = len(seen)
@@ -194,7 +199,7 @@ class SLACAgent(SAC):
         batch = transition_batch(after, valid, belief, belief, self.n_step, self.gamma, seen)
         return split_updates(batch, self.batch_size)
 
-    def histories(self, step: Step) -> Float[Array, "length batch seen"]:
+    def histories(self, step: Timestep) -> Float[Array, "length batch seen"]:
         """What the actor read at each moment after the burn-in of windows (time-major)."""
         x, time = perception(step), jnp.arange(step.reward.shape[0])
         begun = jax.lax.cummax(jnp.where(step.is_first, time[:, None], 0))  # when the moment's episode began

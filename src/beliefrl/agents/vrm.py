@@ -29,7 +29,7 @@ from beliefrl.models.variational_model import VRM, elbo_terms, predict, predicti
 from beliefrl.types import (
     WIDEST,
     Spec,
-    Step,
+    Timestep,
     UserError,
     Window,
     WindowShape,
@@ -181,7 +181,7 @@ class VRMAgent(SAC):
         return Memory(empty if self.has_first else None, empty if self.has_keep else None)
 
     def perceive(
-        self, vrm: VRM | None, memory: LSTMState | None, step: Step, key: Key[Array, ""], explore: Bool[Array, ""]
+        self, vrm: VRM | None, memory: LSTMState | None, step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]
     ) -> LSTMState | None:
         """One model's state after one more moment."""
         if vrm is None:
@@ -193,7 +193,7 @@ class VRMAgent(SAC):
         return jax.tree.map(lambda leaf: leaf[0, 0], inferred.state)
 
     def act(
-        self, state: State, memory: Memory, step: Step, key: Key[Array, ""], explore: Bool[Array, ""]
+        self, state: State, memory: Memory, step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]
     ) -> tuple[Float[Array, " action"], Memory]:
         key_first, key_keep, key_action = jax.random.split(key, 3)
         memory = Memory(
@@ -214,7 +214,7 @@ class VRMAgent(SAC):
         return ("keep",) * self.has_keep + ("first",) * self.has_first
 
     def predict(
-        self, state: State, model: str, step: Step, seen: Bool[Array, " time"], key: Key[Array, ""]
+        self, state: State, model: str, step: Timestep, seen: Bool[Array, " time"], key: Key[Array, ""]
     ) -> Gaussian:
         x, keys = perception(step), jax.random.split(key)
         noise = jax.random.normal(keys[0], (len(x), self.z_size)), jax.random.normal(keys[1], x.shape)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from beliefrl.models.soft_actor_critic import Batch
-from beliefrl.types import Step
+from beliefrl.types import Timestep
 
 
 class Returns(NamedTuple):
@@ -27,7 +27,7 @@ class Returns(NamedTuple):
     discount: Float[Array, "length batch"]  # γ^m
 
 
-def n_step_returns(step: Step, valid: Bool[Array, "length batch"], n: int, gamma: float) -> Returns:
+def n_step_returns(step: Timestep, valid: Bool[Array, "length batch"], n: int, gamma: float) -> Returns:
     """The returns of `length` transitions, given the length + 1 moments between which they lie.
 
     `valid` says which neighbours are transitions; of those that are not, what is returned means nothing.
@@ -52,7 +52,7 @@ def _shifted(leaf: Array, ahead: int) -> Array:
 
 
 def transition_batch(
-    step: Step,
+    step: Timestep,
     valid: Bool[Array, "length batch"],
     belief: Float[Array, "time batch belief"],
     next_belief: Float[Array, "time batch belief"],

@@ -18,7 +18,7 @@ class Pace(NamedTuple):
     per_step: float  # seconds for an environment step of all its seeds together, once it learns
 
 
-class Progress:
+class SweepProgress:
     """What a training has reached that is going on."""
 
     def __init__(self, folder: pathlib.Path, training: Training):
@@ -59,7 +59,7 @@ class Forecast:
 
     def __init__(self, folder: pathlib.Path):
         self.folder = folder
-        self.going: dict[str, Progress] = {}
+        self.going: dict[str, SweepProgress] = {}
         self._seen: dict[str, Pace] = {}  # of each agent, the latest
 
     def watch(self, status: SweepStatus) -> None:
@@ -67,7 +67,7 @@ class Forecast:
         for name in self.going.keys() - status.running.keys():
             del self.going[name]
         for name, training in status.running.items():
-            progress = self.going.setdefault(name, Progress(self.folder, training))
+            progress = self.going.setdefault(name, SweepProgress(self.folder, training))
             progress.read()
             if progress.pace is not None:
                 self._seen[training.agent] = progress.pace

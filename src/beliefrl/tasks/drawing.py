@@ -82,7 +82,7 @@ def paint(picture: Picture) -> UInt8[np.ndarray, "height width 3"]:
     return np.array(image.reduce(SMOOTH))
 
 
-class Window:
+class Viewer:
     """A window that shows pictures, one after another; there can be one at a time."""
 
     def __init__(self, title: str):

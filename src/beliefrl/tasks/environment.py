@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Key, UInt8
 
 from beliefrl import tasks
 from beliefrl.tasks import Observed, Task
-from beliefrl.tasks.drawing import Picture, Window, paint
+from beliefrl.tasks.drawing import Picture, Viewer, paint
 from beliefrl.types import LARGEST, UserError
 
 # The task is static, so environments of equal tasks share what was compiled for the first of them.
@@ -92,7 +92,7 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         if hasattr(self._drawn, "dt"):
             self.metadata = self.metadata | {"render_fps": max(1, round(1 / self._drawn.dt))}
         self._states: list[Any] = []
-        self._window: Window | None = None
+        self._window: Viewer | None = None
 
     @property
     def states(self) -> list[Any]:
@@ -151,7 +151,7 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def _show(self) -> None:
         if self.render_mode == "human":
-            self._window = self._window or Window(type(self._drawn).__name__)
+            self._window = self._window or Viewer(type(self._drawn).__name__)
             self._window.show(paint(self._picture()), self.metadata["render_fps"])
 
     def close(self) -> None:

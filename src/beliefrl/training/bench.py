@@ -96,7 +96,7 @@ class _Timed:
     def learn(self, cycles: int) -> float:
         return self._call(lambda seeds: self.program.learn(seeds, self.step, cycles)[0], cycles * self.agent.cycle)
 
-    def _call(self, phase: Callable[[phases.Seed], phases.Seed], steps: int) -> float:
+    def _call(self, phase: Callable[[phases.SeedState], phases.SeedState], steps: int) -> float:
         """Seconds of one call."""
         before = time.perf_counter()
         self.seeds = jax.block_until_ready(phase(self.seeds))

@@ -13,7 +13,7 @@ from beliefrl.agents import Agent
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.lockstep import Lockstep, environment_seeds
 from beliefrl.training.rollout import Episode
-from beliefrl.types import Spec, Step
+from beliefrl.types import Spec, Timestep
 
 
 class Evaluation:
@@ -43,7 +43,7 @@ class Evaluation:
         lanes = len(obs)
         action: Any = np.zeros((lanes, self.task.spec.action_dim), np.float32)
         never: Any = np.zeros(lanes, bool)
-        step = Step(obs, never.astype(np.float32), action, ~never, never)
+        step = Timestep(obs, never.astype(np.float32), action, ~never, never)
         empty = self.agent.reset(self.task.spec)
         memory = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*keys.shape, *leaf.shape)), empty)
         record, total, length = _Record(lanes, episodes), np.zeros(lanes), np.zeros(lanes, int)
@@ -58,7 +58,7 @@ class Evaluation:
             if done.any():
                 obs = self.environments.restart(done)
                 total, length = np.where(done, 0.0, total), np.where(done, 0, length)
-            step = Step(obs, reward * ~done, action * ~done[:, None], done, never)
+            step = Timestep(obs, reward * ~done, action * ~done[:, None], done, never)
         return jax.tree.map(lambda leaf: leaf.reshape(*keys.shape, episodes), record.episodes)
 
     def close(self) -> None:
@@ -72,7 +72,7 @@ def _perceive(
     spec: Spec,
     state: Any,
     memory: Any,
-    step: Step,
+    step: Timestep,
     key: Key[Array, ""],
     explore: Bool[Array, ""],
     time: Int[Array, ""],

@@ -26,7 +26,7 @@ from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
 from beliefrl.training import phases, rollout
 from beliefrl.training.host_evaluation import Evaluation
 from beliefrl.training.lockstep import Lockstep, environment_seeds
-from beliefrl.training.phases import ACT, REVIVE, Metrics, Program, Seed, Stretch, step_key
+from beliefrl.training.phases import ACT, REVIVE, Metrics, Program, SeedState, Stretch, step_key
 from beliefrl.training.rollout import Episode
 from beliefrl.types import Spec
 
@@ -53,7 +53,7 @@ def program(
         begin=loop.begin,
         explore=loop.explore,
         pretrain=jax.jit(jax.vmap(partial(phases.pretrain, agent), in_axes=(0, None, None)), donate_argnums=0),
-        relive=jax.jit(jax.vmap(partial(phases.relive, agent, task.spec)), donate_argnums=0),
+        refresh=jax.jit(jax.vmap(partial(phases.refresh, agent, task.spec)), donate_argnums=0),
         learn=loop.learn,
         evaluate=partial(evaluation.play, episodes=episodes),
         shapes=loop.shapes,
@@ -108,21 +108,21 @@ class HostLoop:
         self._go_on: Any = jax.jit(jax.vmap(go_on, in_axes=(0, 0, 0, None)), donate_argnums=1)
         self._learn: Any = jax.jit(jax.vmap(learn, in_axes=(0, 0, None)), donate_argnums=0)
 
-    def begin(self, keys: Key[Array, " seed"]) -> Seed:
+    def begin(self, keys: Key[Array, " seed"]) -> SeedState:
         """Seeds before their first steps."""
         return self._begin(keys, self.environments.reset(environment_seeds(keys)))
 
-    def shapes(self, keys: Key[Array, " seed"]) -> Seed:
+    def shapes(self, keys: Key[Array, " seed"]) -> SeedState:
         """What `begin` gives, without its numbers."""
         obs = jax.ShapeDtypeStruct((len(keys), self.spec.obs_dim), jnp.float32)
         return jax.eval_shape(self._begin, keys, obs)
 
-    def revive(self, seeds: Seed, step: int) -> Seed:
+    def revive(self, seeds: SeedState, step: int) -> SeedState:
         """Seeds whose environments were not saved: a new episode begins, as if the one in hand had never gone on."""
         keys = jax.vmap(lambda key: step_key(key, jnp.asarray(step), REVIVE))(seeds.key)
         return seeds._replace(actor=self._first(self.environments.reset(environment_seeds(keys))))
 
-    def explore(self, seeds: Seed, first: int, steps: int) -> tuple[Seed, Stretch]:
+    def explore(self, seeds: SeedState, first: int, steps: int) -> tuple[SeedState, Stretch]:
         """Environment steps without updates; none of them only compiles."""
         told, deed, networks = _Told(), self._act(seeds, first), _networks(seeds.state)
         if steps == 0:
@@ -134,7 +134,7 @@ class HostLoop:
             told.episodes.append(episode)
         return seeds, told.stretch()
 
-    def learn(self, seeds: Seed, first: int, cycles: int) -> tuple[Seed, Stretch]:
+    def learn(self, seeds: SeedState, first: int, cycles: int) -> tuple[SeedState, Stretch]:
         """`cycles` cycles of steps and updates from environment step `first` on; none of them only compiles."""
         told, deed, cycle = _Told(), self._act(seeds, first), self.agent.cycle
         if cycles == 0:
@@ -150,7 +150,7 @@ class HostLoop:
             told.episodes.append(episode)
         return seeds, told.stretch()
 
-    def _compile(self, seeds: Seed, deed: "Deed", learns: bool) -> None:
+    def _compile(self, seeds: SeedState, deed: "Deed", learns: bool) -> None:
         """Compile what follows a step of the environments, so that no compilation is taken for a slow environment."""
         lanes = len(deed.action)
         obs, number, never = (
@@ -165,7 +165,7 @@ class HostLoop:
         if learns:
             self._learn = self._learn.lower(seeds, answer, 0).compile()
 
-    def _step(self, seeds: Seed, deed: "Deed", step: int, told: "_Told") -> "Answer":
+    def _step(self, seeds: SeedState, deed: "Deed", step: int, told: "_Told") -> "Answer":
         """One step of every environment."""
         try:
             obs, reward, terminated, truncated, success = self.environments.step(np.asarray(deed.action))
@@ -191,17 +191,19 @@ class _Told:
         return Stretch(means, jax.tree.map(lambda *each: np.stack(each, axis=1), *episodes) if episodes else None)
 
 
-def _begin(agent: Agent, spec: Spec, capacity: int, key: Key[Array, ""], obs: Float[Array, " obs"]) -> Seed:
+def _begin(agent: Agent, spec: Spec, capacity: int, key: Key[Array, ""], obs: Float[Array, " obs"]) -> SeedState:
     key_state, _, key = jax.random.split(key, 3)
     return phases.seed_of(agent, spec, capacity, rollout.first(agent, spec, (), obs), key_state, key)
 
 
-def _act(agent: Agent, seed: Seed, step: Int[Array, ""]) -> Deed:
+def _act(agent: Agent, seed: SeedState, step: Int[Array, ""]) -> Deed:
     key_move, _, _ = jax.random.split(step_key(seed.key, step, ACT), 3)
     return Deed(*rollout.act(agent, seed.state, seed.actor, key_move, jnp.array(True)))
 
 
-def _record(agent: Agent, spec: Spec, seed: Seed, answer: Answer, step: Int[Array, ""]) -> tuple[Seed, Episode]:
+def _record(
+    agent: Agent, spec: Spec, seed: SeedState, answer: Answer, step: Int[Array, ""]
+) -> tuple[SeedState, Episode]:
     """Record what the environment answered at this step."""
     _, key_last, _ = jax.random.split(step_key(seed.key, step, ACT), 3)
     action, memory = answer.deed
@@ -219,16 +221,16 @@ def _networks(state: Any) -> Any:
 
 
 def _go_on(
-    agent: Agent, spec: Spec, networks: Any, rest: Seed, answer: Answer, step: Int[Array, ""]
-) -> tuple[Seed, Deed, Episode]:
+    agent: Agent, spec: Spec, networks: Any, rest: SeedState, answer: Answer, step: Int[Array, ""]
+) -> tuple[SeedState, Deed, Episode]:
     """Record, and act again."""
     seed, episode = _record(agent, spec, rest._replace(state=networks), answer, step)
     return seed._replace(state=()), _act(agent, seed, step + 1), episode
 
 
 def _learn(
-    agent: Agent, spec: Spec, seed: Seed, answer: Answer, step: Int[Array, ""]
-) -> tuple[Seed, Deed, Episode, Metrics]:
+    agent: Agent, spec: Spec, seed: SeedState, answer: Answer, step: Int[Array, ""]
+) -> tuple[SeedState, Deed, Episode, Metrics]:
     """Record the last step of a cycle, learn, and act again."""
     seed, episode = _record(agent, spec, seed, answer, step)
     state, metrics = phases.learn_cycle(agent, seed, step + 1 - agent.cycle)

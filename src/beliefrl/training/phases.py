@@ -23,7 +23,7 @@ from beliefrl.tasks import Task
 from beliefrl.training import replay as ring
 from beliefrl.training import rollout
 from beliefrl.training.replay import Replay
-from beliefrl.training.rollout import Actor, Episode
+from beliefrl.training.rollout import ActorState, Episode
 from beliefrl.types import Spec
 
 Metrics = dict[str, Float[Array, "..."]]
@@ -34,11 +34,11 @@ def stretch_length(agent: Agent) -> int:
     return max(100 // agent.cycle, 1) * agent.cycle
 
 
-class Seed(NamedTuple):
+class SeedState(NamedTuple):
     """All of one training. Mapped over seeds, every leaf has a leading axis `seed`."""
 
     state: Any  # the agent's
-    actor: Actor
+    actor: ActorState
     replay: Replay
     key: Key[Array, ""]
 
@@ -50,17 +50,17 @@ class Stretch(NamedTuple):
     episodes: Episode | None  # leaves (stretch,): one entry a step, done only where an episode ended
 
 
-def begin(agent: Agent, task: Task, capacity: int, key: Key[Array, ""]) -> Seed:
+def begin(agent: Agent, task: Task, capacity: int, key: Key[Array, ""]) -> SeedState:
     """A seed before its first step; `capacity` moments fit its replay."""
     key_state, key_actor, key = jax.random.split(key, 3)
     return seed_of(agent, task.spec, capacity, rollout.begin(agent, task, key_actor), key_state, key)
 
 
 def seed_of(
-    agent: Agent, spec: Spec, capacity: int, actor: Actor, key_state: Key[Array, ""], key: Key[Array, ""]
-) -> Seed:
+    agent: Agent, spec: Spec, capacity: int, actor: ActorState, key_state: Key[Array, ""], key: Key[Array, ""]
+) -> SeedState:
     """A new agent and an empty replay for an actor at its first moment."""
-    return Seed(agent.init(key_state, spec), actor, ring.init(rollout.moment(agent, actor), capacity), key)
+    return SeedState(agent.init(key_state, spec), actor, ring.init(rollout.moment(agent, actor), capacity), key)
 
 
 def _no_episodes(agent: Agent) -> Episode:
@@ -77,10 +77,12 @@ def step_key(key: Key[Array, ""], step: Int[Array, ""], purpose: int) -> Key[Arr
     return jax.random.fold_in(jax.random.fold_in(key, purpose), step)
 
 
-ACT, UPDATE, SAMPLE, CYCLE, PRETRAIN, RELIVE, EVALUATE, REVIVE = range(8)  # purposes of keys: no two share one
+ACT, UPDATE, SAMPLE, CYCLE, PRETRAIN, REFRESH, EVALUATE, REVIVE = range(8)  # purposes of keys: no two share one
 
 
-def explore(agent: Agent, task: Task, seed: Seed, first: Int[Array, ""], steps: Int[Array, ""]) -> tuple[Seed, Stretch]:
+def explore(
+    agent: Agent, task: Task, seed: SeedState, first: Int[Array, ""], steps: Int[Array, ""]
+) -> tuple[SeedState, Stretch]:
     """Environment steps `first` to `first + steps` without updates; at most `stretch_length` of them."""
 
     def step(i, carry):
@@ -97,10 +99,12 @@ def _sum_metrics(shapes: Any) -> Metrics:
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
 
-def pretrain(agent: Agent, seed: Seed, first: Int[Array, ""], updates: Int[Array, ""]) -> tuple[Seed, Metrics]:
+def pretrain(
+    agent: Agent, seed: SeedState, first: Int[Array, ""], updates: Int[Array, ""]
+) -> tuple[SeedState, Metrics]:
     """Updates `first` to `first + updates` of the pre-training; metrics are their means."""
 
-    def update(seed: Seed, number: Int[Array, ""]) -> tuple[Seed, Metrics]:
+    def update(seed: SeedState, number: Int[Array, ""]) -> tuple[SeedState, Metrics]:
         key_sample, key = jax.random.split(step_key(seed.key, number, PRETRAIN))
         windows = ring.sample(seed.replay, key_sample, agent.pretrain_windows, agent.window)
         state, metrics = agent.pretrain(seed.state, windows, key)
@@ -116,15 +120,17 @@ def pretrain(agent: Agent, seed: Seed, first: Int[Array, ""], updates: Int[Array
     return seed, jax.tree.map(lambda total: total / jnp.maximum(updates, 1), totals)
 
 
-def relive(agent: Agent, spec: Spec, seed: Seed) -> Seed:
+def refresh(agent: Agent, spec: Spec, seed: SeedState) -> SeedState:
     """Perceive again, with the pre-trained networks, everything recorded so far (at most 2 moments a step)."""
     length = min(2 * agent.step_start_rl, ring.capacity(seed.replay))
-    key = jax.random.fold_in(seed.key, RELIVE)
-    actor, replay = rollout.relive(agent, spec, seed.state, seed.actor, seed.replay, key, length)
+    key = jax.random.fold_in(seed.key, REFRESH)
+    actor, replay = rollout.refresh(agent, spec, seed.state, seed.actor, seed.replay, key, length)
     return seed._replace(actor=actor, replay=replay)
 
 
-def learn(agent: Agent, task: Task, seed: Seed, first: Int[Array, ""], cycles: Int[Array, ""]) -> tuple[Seed, Stretch]:
+def learn(
+    agent: Agent, task: Task, seed: SeedState, first: Int[Array, ""], cycles: Int[Array, ""]
+) -> tuple[SeedState, Stretch]:
     """`cycles` cycles of learning from environment step `first` on; at most `stretch_length` steps in all."""
     shapes = jax.eval_shape(partial(_cycle, agent, task), seed, _no_episodes(agent), first, first)[2]
 
@@ -138,8 +144,8 @@ def learn(agent: Agent, task: Task, seed: Seed, first: Int[Array, ""], cycles: I
 
 
 def _cycle(
-    agent: Agent, task: Task, seed: Seed, log: Episode, first: Int[Array, ""], index: Int[Array, ""]
-) -> tuple[Seed, Episode, Metrics]:
+    agent: Agent, task: Task, seed: SeedState, log: Episode, first: Int[Array, ""], index: Int[Array, ""]
+) -> tuple[SeedState, Episode, Metrics]:
     """One cycle, from environment step `first` on, whose entries in the log begin at `index`.
 
     Its moments are added before any are drawn, and in a loop whose length XLA does not know (it would inline one of a
@@ -157,7 +163,7 @@ def _cycle(
     return seed._replace(state=state), log, metrics
 
 
-def learn_cycle(agent: Agent, seed: Seed, first: Int[Array, ""]) -> tuple[Any, Metrics]:
+def learn_cycle(agent: Agent, seed: SeedState, first: Int[Array, ""]) -> tuple[Any, Metrics]:
     """What is learned when the steps of the cycle that began at environment step `first` are done: the new state."""
     windows = ring.sample(seed.replay, step_key(seed.key, first, SAMPLE), agent.cycle_windows, agent.window)
     state, batches, model_metrics = agent.begin_cycle(seed.state, windows, step_key(seed.key, first, CYCLE))
@@ -182,16 +188,16 @@ def evaluate(agent: Agent, task: Task, state: Any, key: Key[Array, ""], episodes
 
 
 class Program(NamedTuple):
-    """The phases of training, compiled for many seeds: leaves of every Seed have a leading axis `seed`."""
+    """The phases of training, compiled for many seeds: leaves of every SeedState have a leading axis `seed`."""
 
-    begin: Callable[..., Seed]  # keys (seed,)
-    explore: Callable[..., tuple[Seed, Stretch]]  # seeds, first, steps
-    pretrain: Callable[..., tuple[Seed, Metrics]]  # seeds, first, updates
-    relive: Callable[..., Seed]  # seeds
-    learn: Callable[..., tuple[Seed, Stretch]]  # seeds, first, cycles
+    begin: Callable[..., SeedState]  # keys (seed,)
+    explore: Callable[..., tuple[SeedState, Stretch]]  # seeds, first, steps
+    pretrain: Callable[..., tuple[SeedState, Metrics]]  # seeds, first, updates
+    refresh: Callable[..., SeedState]  # seeds
+    learn: Callable[..., tuple[SeedState, Stretch]]  # seeds, first, cycles
     evaluate: Callable[..., Episode]  # states (seed, ...), keys (seed,); leaves (seed, 2, episodes)
-    shapes: Callable[..., Seed]  # keys (seed,); what `begin` gives, without its numbers
-    revive: Callable[..., Seed] = lambda seeds, step: seeds  # after they were read from a checkpoint
+    shapes: Callable[..., SeedState]  # keys (seed,); what `begin` gives, without its numbers
+    revive: Callable[..., SeedState] = lambda seeds, step: seeds  # after they were read from a checkpoint
     close: Callable[[], None] = lambda: None  # when no phase will be called any more
 
 
@@ -206,7 +212,7 @@ def compile_program(agent: Agent, task: Task, capacity: int, episodes: int) -> P
         begin=start,
         explore=mapped(partial(explore, agent, task), 2),
         pretrain=mapped(partial(pretrain, agent), 2),
-        relive=mapped(partial(relive, agent, task.spec), 0),
+        refresh=mapped(partial(refresh, agent, task.spec), 0),
         learn=mapped(partial(learn, agent, task), 2),
         evaluate=jax.jit(jax.vmap(partial(evaluate, agent, task, episodes=episodes))),
         shapes=partial(jax.eval_shape, start),

@@ -11,15 +11,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, Key
 
-from beliefrl.types import Moment, Step, Window, WindowShape
+from beliefrl.types import StoredTimestep, Timestep, Window, WindowShape
 
 
 class Replay(NamedTuple):
-    moments: Moment  # leaves (capacity, ...)
+    moments: StoredTimestep  # leaves (capacity, ...)
     added: Int[Array, ""]  # moments ever added; the ring holds the last `capacity` of them
 
 
-def init(moment: Moment, capacity: int) -> Replay:
+def init(moment: StoredTimestep, capacity: int) -> Replay:
     """An empty ring for moments shaped as `moment`."""
     return Replay(jax.tree.map(lambda leaf: jnp.zeros((capacity, *leaf.shape), leaf.dtype), moment), jnp.zeros((), int))
 
@@ -29,7 +29,7 @@ def capacity(replay: Replay) -> int:
     return replay.moments.step.reward.shape[0]
 
 
-def add(replay: Replay, moment: Moment, keep: Bool[Array, ""] | bool = True) -> Replay:
+def add(replay: Replay, moment: StoredTimestep, keep: Bool[Array, ""] | bool = True) -> Replay:
     """Append a moment where `keep`; the oldest makes room."""
     size = capacity(replay)
     index = jnp.where(keep, replay.added % size, size)
@@ -81,13 +81,13 @@ def _in_episodes(
     return begin + start, begin, end
 
 
-def gather(replay: Replay, number: Int[Array, "*shape"]) -> Moment:
+def gather(replay: Replay, number: Int[Array, "*shape"]) -> StoredTimestep:
     """The moments of these running numbers (0 is the first ever added), leaves (*shape, ...)."""
     index = number % capacity(replay)
     return jax.tree.map(lambda leaf: leaf[index], replay.moments)
 
 
-def history(replay: Replay, length: int) -> tuple[Step, Bool[Array, " length"]]:
+def history(replay: Replay, length: int) -> tuple[Timestep, Bool[Array, " length"]]:
     """The first `length` moments ever added, and which of them exist; meant for before the ring is full."""
     number = jnp.arange(length)
     return gather(replay, number).step, number < replay.added

@@ -21,14 +21,14 @@ from beliefrl.agents import Agent
 from beliefrl.tasks import Task
 from beliefrl.training import replay as ring
 from beliefrl.training.replay import Replay
-from beliefrl.types import Moment, Spec, Step
+from beliefrl.types import Spec, StoredTimestep, Timestep
 
 
-class Actor(NamedTuple):
+class ActorState(NamedTuple):
     """One agent at one moment of one episode."""
 
     task_state: Any
-    step: Step  # the moment in hand
+    step: Timestep  # the moment in hand
     memory: Any  # before that moment is perceived
     length: Int[Array, ""]  # steps of this episode so far
     total: Float[Array, ""]  # its rewards so far
@@ -43,7 +43,7 @@ class Episode(NamedTuple):
     success: Bool[Array, "*batch"]
 
 
-def _strong(actor: Actor) -> Actor:
+def _strong(actor: ActorState) -> ActorState:
     """The same without weak types, as Python's numbers in a task leave them: they would make XLA compile twice."""
 
     def cast(leaf: Array) -> Array:
@@ -53,30 +53,30 @@ def _strong(actor: Actor) -> Actor:
     return jax.tree.map(cast, actor)
 
 
-def first(agent: Agent, spec: Spec, task_state: Any, obs: Float[Array, " obs"]) -> Actor:
+def first(agent: Agent, spec: Spec, task_state: Any, obs: Float[Array, " obs"]) -> ActorState:
     """The first moment of an episode: no reward, no action before it, an empty memory."""
-    step = Step(
+    step = Timestep(
         obs=obs,
         reward=jnp.array(0.0),
         prev_action=jnp.zeros(spec.action_dim),
         is_first=jnp.array(True),
         terminated=jnp.array(False),
     )
-    return _strong(Actor(task_state, step, agent.reset(spec), jnp.array(0), jnp.array(0.0)))
+    return _strong(ActorState(task_state, step, agent.reset(spec), jnp.array(0), jnp.array(0.0)))
 
 
-def begin(agent: Agent, task: Task, key: Key[Array, ""]) -> Actor:
+def begin(agent: Agent, task: Task, key: Key[Array, ""]) -> ActorState:
     """An episode begins."""
     return first(agent, task.spec, *task.reset(key))
 
 
-def moment(agent: Agent, actor: Actor) -> Moment:
+def moment(agent: Agent, actor: ActorState) -> StoredTimestep:
     """A moment as the replay keeps it; its values are of no account, its shapes are."""
-    return Moment(actor.step, agent.note(actor.memory))
+    return StoredTimestep(actor.step, agent.note(actor.memory))
 
 
 def act(
-    agent: Agent, state: Any, actor: Actor, key: Key[Array, ""], explore: Bool[Array, ""]
+    agent: Agent, state: Any, actor: ActorState, key: Key[Array, ""], explore: Bool[Array, ""]
 ) -> tuple[Float[Array, " action"], Any]:
     """The action at the moment in hand, and the memory that has perceived it; `key` is that of `move`."""
     key_act, _ = jax.random.split(key)
@@ -84,22 +84,22 @@ def act(
 
 
 def arrive(
-    actor: Actor,
+    actor: ActorState,
     memory: Any,
     action: Float[Array, " action"],
     task_state: Any,
     obs: Float[Array, " obs"],
     reward: Float[Array, ""],
     terminated: Bool[Array, ""],
-) -> Actor:
+) -> ActorState:
     """The next moment, terminal or not; its memory is of the one before."""
-    step = Step(obs, reward, action, jnp.array(False), terminated)
-    return _strong(Actor(task_state, step, memory, actor.length + 1, actor.total + reward))
+    step = Timestep(obs, reward, action, jnp.array(False), terminated)
+    return _strong(ActorState(task_state, step, memory, actor.length + 1, actor.total + reward))
 
 
 def move(
-    agent: Agent, task: Task, state: Any, actor: Actor, key: Key[Array, ""], explore: Bool[Array, ""]
-) -> tuple[Actor, Episode]:
+    agent: Agent, task: Task, state: Any, actor: ActorState, key: Key[Array, ""], explore: Bool[Array, ""]
+) -> tuple[ActorState, Episode]:
     """Act and step; returns the actor at the next moment."""
     action, memory = act(agent, state, actor, key, explore)
     _, key_task = jax.random.split(key)
@@ -113,23 +113,23 @@ def record(
     agent: Agent,
     state: Any,
     replay: Replay,
-    actor: Actor,
-    after: Actor,
-    fresh: Actor,
+    actor: ActorState,
+    after: ActorState,
+    fresh: ActorState,
     done: Bool[Array, ""],
     key: Key[Array, ""],
-) -> tuple[Actor, Replay]:
+) -> tuple[ActorState, Replay]:
     """Keep the moment that was in hand, and the one `after` it where it is the last; returns what is in hand now."""
-    replay = ring.add(replay, Moment(actor.step, agent.note(after.memory)))
+    replay = ring.add(replay, StoredTimestep(actor.step, agent.note(after.memory)))
     # Only its note is used: where that needs no action, XLA drops the acting.
     _, last = agent.act(state, after.memory, after.step, key, jnp.array(True))
-    replay = ring.add(replay, Moment(after.step, agent.note(last)), done)
+    replay = ring.add(replay, StoredTimestep(after.step, agent.note(last)), done)
     return jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, after), replay
 
 
 def advance(
-    agent: Agent, task: Task, state: Any, actor: Actor, replay: Replay, key: Key[Array, ""]
-) -> tuple[Actor, Replay, Episode]:
+    agent: Agent, task: Task, state: Any, actor: ActorState, replay: Replay, key: Key[Array, ""]
+) -> tuple[ActorState, Replay, Episode]:
     """One environment step of training, recorded."""
     key_move, key_last, key_reset = jax.random.split(key, 3)
     after, episode = move(agent, task, state, actor, key_move, jnp.array(True))
@@ -137,9 +137,9 @@ def advance(
     return *record(agent, state, replay, actor, after, fresh, episode.done, key_last), episode
 
 
-def relive(
-    agent: Agent, spec: Spec, state: Any, actor: Actor, replay: Replay, key: Key[Array, ""], length: int
-) -> tuple[Actor, Replay]:
+def refresh(
+    agent: Agent, spec: Spec, state: Any, actor: ActorState, replay: Replay, key: Key[Array, ""], length: int
+) -> tuple[ActorState, Replay]:
     """Perceive the first `length` moments of the replay again with networks that have changed since.
 
     Returns the actor with the memory it would have now, and the replay with new notes.

@@ -15,25 +15,25 @@ from beliefrl.runs.options import Options
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
 from beliefrl.training import host_loop, phases
-from beliefrl.training.phases import Metrics, Program, Seed
+from beliefrl.training.phases import Metrics, Program, SeedState
 from beliefrl.training.rollout import Episode
 from beliefrl.types import UserError
 
 
-class Progress(NamedTuple):
+class TrainingProgress(NamedTuple):
     """How far a training is; with all its arrays, what is needed to go on."""
 
     step: int = 0
     pretrained: int = 0  # updates of the pre-training
-    relived: bool = False  # whether the pre-training is over
+    refreshed: bool = False  # whether the pre-training is over
     evaluated: int = 0  # step of the last evaluation
 
 
 class Snapshot(NamedTuple):
     """A training between two stretches; its arrays are used up when the next one begins."""
 
-    progress: Progress
-    seeds: Seed
+    progress: TrainingProgress
+    seeds: SeedState
 
 
 class Event(NamedTuple):
@@ -54,7 +54,7 @@ def stages(
     agent: Agent,
     task: Task | GymnasiumTask,
     options: Options,
-    restore: Callable[[Seed], Snapshot] | None = None,
+    restore: Callable[[SeedState], Snapshot] | None = None,
     tell: Callable[[str], None] | None = None,
 ) -> Iterator[Event]:
     """Train; yields an Event before whatever takes long and after whatever gave something to tell.
@@ -80,7 +80,7 @@ def stages(
     try:
         if restore is None:
             yield Event("compiling the agent", 0)
-            start = Snapshot(Progress(), program.begin(keys))
+            start = Snapshot(TrainingProgress(), program.begin(keys))
         else:
             at, seeds = restore(program.shapes(keys))
             start = Snapshot(at, program.revive(seeds, at.step))
@@ -95,7 +95,9 @@ def stages(
         program.close()
 
 
-def _stages(agent: Agent, program: Program, options: Options, at: Progress, seeds: Seed) -> Iterator[Event]:
+def _stages(
+    agent: Agent, program: Program, options: Options, at: TrainingProgress, seeds: SeedState
+) -> Iterator[Event]:
     explored = min(agent.step_start_rl, options.steps)
     stretch = phases.stretch_length(agent)
 
@@ -113,7 +115,7 @@ def _stages(agent: Agent, program: Program, options: Options, at: Progress, seed
             at = at._replace(evaluated=at.step)
         yield Event("exploring", at.step, snapshot=Snapshot(at, seeds))
 
-    if at.step < options.steps and agent.pretrain_updates and not at.relived:
+    if at.step < options.steps and agent.pretrain_updates and not at.refreshed:
         if at.pretrained < agent.pretrain_updates:
             yield Event("compiling the pre-training", at.step)
             seeds, _ = program.pretrain(seeds, at.pretrained, 0)
@@ -125,7 +127,7 @@ def _stages(agent: Agent, program: Program, options: Options, at: Progress, seed
             told = {f"pretrain_{name}": mean for name, mean in metrics.items()}
             part = at.pretrained, agent.pretrain_updates
             yield Event("pre-training", at.step, told, part=part, snapshot=Snapshot(at, seeds))
-        seeds, at = program.relive(seeds), at._replace(relived=True)
+        seeds, at = program.refresh(seeds), at._replace(refreshed=True)
 
     if at.step < options.steps:
         yield Event("compiling the learning", at.step)
@@ -149,7 +151,7 @@ def _stages(agent: Agent, program: Program, options: Options, at: Progress, seed
 def capacity(agent: Agent, options: Options) -> int:
     """Moments in a seed's replay: no more than can come, a moment a step and one more where an episode ends."""
     if options.steps > agent.step_start_rl:
-        needed = max(2 * agent.step_start_rl, agent.window.length + 1)  # `relive` wants all of the exploration
+        needed = max(2 * agent.step_start_rl, agent.window.length + 1)  # `refresh` wants all of the exploration
         if options.replay_capacity < needed:
             raise UserError(
                 f"replay_capacity={options.replay_capacity} is too small: this agent needs at least {needed}."
@@ -162,7 +164,7 @@ def _until(step: int, every: int) -> int:
     return every - step % every
 
 
-def _evaluation(program: Program, seeds: Seed, step: int, doing: str) -> Iterator[Event]:
+def _evaluation(program: Program, seeds: SeedState, step: int, doing: str) -> Iterator[Event]:
     yield Event("evaluating", step)
     keys = jax.vmap(lambda key: jax.random.fold_in(jax.random.fold_in(key, phases.EVALUATE), step))(seeds.key)
     try:

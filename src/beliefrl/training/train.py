@@ -27,8 +27,8 @@ from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import log
 from beliefrl.training.evaluation import agent_of, task_of, tuples
-from beliefrl.training.phases import Seed
-from beliefrl.training.schedule import Event, Options, Progress, Snapshot, capacity, stages
+from beliefrl.training.phases import SeedState
+from beliefrl.training.schedule import Event, Options, Snapshot, TrainingProgress, capacity, stages
 from beliefrl.training.stop import Requests, Stopped
 from beliefrl.types import UserError
 
@@ -142,13 +142,13 @@ class _Training:
         self.report = report or (lambda event: None)
         self.has_success = task.spec.has_success
         self.checkpoints = Checkpoints(recorder.folder, options.keep_checkpoints)
-        self.last, self.saved_at = Progress(), time.monotonic()
+        self.last, self.saved_at = TrainingProgress(), time.monotonic()
         self.results = recorder.results()
         self.lost: set[int] = set()  # indices of the seeds that have diverged
         self.step = 0
         self.requests = Requests(partial(self._note, "stopping after this stretch; Ctrl-C again ends at once"))
 
-    def run(self, restore: Callable[[Seed], Snapshot] | None = None) -> Run:
+    def run(self, restore: Callable[[SeedState], Snapshot] | None = None) -> Run:
         """To the end, or until it is stopped."""
         try:
             with self.recorder, jax.default_matmul_precision(self.options.precision):
@@ -162,7 +162,7 @@ class _Training:
             ) from None
         return self.recorder
 
-    def _train(self, restore: Callable[[Seed], Snapshot] | None) -> None:
+    def _train(self, restore: Callable[[SeedState], Snapshot] | None) -> None:
         try:
             with self.checkpoints, self.requests:
                 for event in stages(self.agent, self.task, self.options, restore, self._note):
@@ -177,7 +177,7 @@ class _Training:
         self.recorder.rewind(dict.fromkeys(self.recorder.seeds, 0))
         self._note("no checkpoint was written: begins again from step 0")
 
-    def restore(self, shapes: Seed) -> Snapshot:
+    def restore(self, shapes: SeedState) -> Snapshot:
         """From the last good checkpoint; the log is cut back to what it was then."""
         ring = shapes.replay
         like = shapes._replace(replay=ring._replace(moments=()))
@@ -185,7 +185,7 @@ class _Training:
         for why in found.passed_over:
             self.report(Event("resuming", found.step, note=f"{why} The checkpoint before it is used."))
         self.recorder.rewind({int(seed): length for seed, length in found.progress["metrics"].items()})
-        self.last, self.lost = Progress(*found.progress["progress"]), set(found.progress["lost"])
+        self.last, self.lost = TrainingProgress(*found.progress["progress"]), set(found.progress["lost"])
         self.report(Event("resuming", found.step, note=f"goes on from the checkpoint of step {found.step:,}"))
         if isinstance(self.task, GymnasiumTask):
             self.report(Event("resuming", found.step, note="a new episode begins: an environment cannot be saved"))
@@ -235,10 +235,10 @@ class _Training:
         progress, options = snapshot.progress, self.options
         steps = progress.step - self.last.step >= options.checkpoint_steps > 0
         minutes = time.monotonic() - self.saved_at >= 60 * options.checkpoint_minutes > 0
-        relived = progress.relived and not self.last.relived
-        return bool(steps or minutes or relived or self._has_ended(progress) or self.requests.number)
+        refreshed = progress.refreshed and not self.last.refreshed
+        return bool(steps or minutes or refreshed or self._has_ended(progress) or self.requests.number)
 
-    def _has_ended(self, progress: Progress) -> bool:
+    def _has_ended(self, progress: TrainingProgress) -> bool:
         return progress.step >= self.options.steps and progress.evaluated == progress.step
 
     def _consider(self, snapshot: Snapshot) -> None:
@@ -246,7 +246,7 @@ class _Training:
         if not self._is_due(snapshot):
             return
         progress, asked = snapshot.progress, self.requests.number
-        if progress.relived and not self.last.relived:
+        if progress.refreshed and not self.last.refreshed:
             self.checkpoints.forget_moments()
         self._save(snapshot)
         if asked and not self._has_ended(progress):

@@ -18,7 +18,7 @@ from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import GymnasiumTask, success_of
 from beliefrl.training.evaluation import restore_seed
-from beliefrl.types import LARGEST, Step, UserError
+from beliefrl.types import LARGEST, Timestep, UserError
 from beliefrl.viewing import rendering
 from beliefrl.viewing.rendering import Pixels
 
@@ -26,7 +26,7 @@ from beliefrl.viewing.rendering import Pixels
 class Trajectory(NamedTuple):
     """An episode as it was played. It has one moment more than steps: the last observation is a moment too."""
 
-    steps: Step  # numpy, leaves (time, ...); reward[t] and prev_action[t] came before obs[t]
+    steps: Timestep  # numpy, leaves (time, ...); reward[t] and prev_action[t] came before obs[t]
     total: float  # undiscounted return
     success: bool | None  # whether it reached its aim; None where the task has none
     frames: dict[int, Pixels]  # those that were asked for, by the moment they show
@@ -107,11 +107,11 @@ class Player:
         return Trajectory(steps_played, total, success if spec.has_success else None, frames)
 
 
-def _moment(obs: Any, reward: float, action: Any, is_first: bool = False, terminated: bool = False) -> Step:
+def _moment(obs: Any, reward: float, action: Any, is_first: bool = False, terminated: bool = False) -> Timestep:
     """A moment in numpy."""
     numbers: Any = np.asarray(obs, np.float32), np.float32(reward), np.asarray(action, np.float32)
     flags: Any = np.bool_(is_first), np.bool_(terminated)
-    return Step(*numbers, *flags)
+    return Timestep(*numbers, *flags)
 
 
 def play(

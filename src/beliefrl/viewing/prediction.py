@@ -29,7 +29,7 @@ from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.evaluation import restore_seed
-from beliefrl.types import LARGEST, Step, UserError, perception
+from beliefrl.types import LARGEST, Timestep, UserError, perception
 from beliefrl.viewing.episodes import Player, check_episode
 
 START = 50  # moments that the closed loop sees by default
@@ -58,7 +58,7 @@ def predict(
     agent: Any,
     state: Any,
     model: str,
-    steps: Step,
+    steps: Timestep,
     seen: Bool[Array, " time"],
     samples: int,
     key: Key[Array, ""],
