@@ -46,5 +46,6 @@ def test_deploying_runs_on_what_was_trained(tmp_path):
     words = "-m beliefrl.cli train sac-lstm gym:Pendulum-v1 --observe 2 --steps 100 --eval-episodes 1 --out run"
     output(tmp_path, *words.split())
     printed = output(tmp_path, EXAMPLES / "04_deploying.py", "run", "--episodes", "1")
-    file, policy = printed.splitlines()[1].split(" and the policy's: ")
+    assert printed.startswith("<Policy sac-lstm on gym:Pendulum-v1: observation (1,), action (1,), seed 0>\n")
+    file, policy = printed.splitlines()[-1].split(" and the policy's: ")
     assert file.removeprefix("the file's first action: ") == policy
