@@ -20,7 +20,7 @@ myst_heading_anchors = 3
 nitpicky = True
 nitpick_ignore_regex = [
     ("py:.*", r"(?!beliefrl\.).*"),  # of other libraries
-    ("py:class", r"beliefrl\.(soft_actor_critic\.Network|nets\.Params)"),  # type variables
+    ("py:class", r"beliefrl\.models\.(soft_actor_critic\.Network|nets\.Params)"),  # type variables
 ]
 
 html_theme = "furo"
