@@ -7,7 +7,7 @@
 By then two seeds came to -750 and -495; random play gets about -1200.
 
 An agent is a frozen dataclass of hyperparameters whose methods are pure functions, for one seed and one actor; the
-training loop maps them over seeds and environments. `SAC` brings Table 1 of the paper and the controller; what is left
+training loop maps them over seeds and environments. `SACAgent` brings Table 1 of the paper and the controller; what is left
 to say is what it remembers while acting, which windows of the past it learns from, and how a belief is formed of both.
 """
 
@@ -20,7 +20,7 @@ import tyro
 from jaxtyping import Array, Bool, Float, Key
 
 import beliefrl
-from beliefrl.agents.sac import SAC, Metrics
+from beliefrl.agents.base import Metrics, SACAgent
 from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState
 from beliefrl.types import Spec, Timestep, Window, WindowShape, transitions
 
@@ -33,7 +33,7 @@ class State(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class StackAgent(SAC):
+class StackAgent(SACAgent):
     """Soft actor-critic on the last `stack` observations; before an episode's first, on copies of it."""
 
     stack: int = 3

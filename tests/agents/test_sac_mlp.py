@@ -12,7 +12,7 @@ from agents.moments import SPEC, differ, windows
 from beliefrl.agents.sac_mlp import SACMLPAgent
 from beliefrl.types import Timestep, UserError, Window
 
-GOLDEN = pathlib.Path(__file__).parents[1] / "golden" / "sac.npz"
+GOLDEN = pathlib.Path(__file__).parents[1] / "models" / "golden" / "sac.npz"
 AGENT = SACMLPAgent(policy_layers=(8, 8), value_layers=(8, 8), batch_size=6)
 STANDARDISED = dataclasses.replace(AGENT, standardise=True)
 

@@ -155,10 +155,10 @@ def test_batches_are_aligned_in_time(state):
     window = windows(jax.random.key(1), 2, TIME)
     batch = jax.jit(AGENT.batches)(state.model, window, jax.random.key(2))
     step = time_major(window, 0, None).step
-    assert batch.seen.shape == (1, 2 * AGENT.seq_len, AGENT.history * 4)
+    assert batch.actor_input.shape == (1, 2 * AGENT.seq_len, AGENT.history * 4)
     for t, sequence in ((0, 0), (1, 1), (3, 0)):
         row, now = 2 * t + sequence, AGENT.history - 1 + t
-        np.testing.assert_array_equal(batch.seen[0, row, -4:], perception(step)[now, sequence])
+        np.testing.assert_array_equal(batch.actor_input[0, row, -4:], perception(step)[now, sequence])
         np.testing.assert_array_equal(batch.action[0, row], step.prev_action[now + 1, sequence])
         assert batch.reward[0, row] == step.reward[now + 1, sequence]
         if t:

@@ -11,8 +11,8 @@ import pytest
 from agents.moments import SMALL, SPEC, differ, same
 from beliefrl import agents
 from beliefrl.agents.vrm import VRMAgent
-from beliefrl.models.nets import draw, standardised, unscaled
-from beliefrl.models.variational_model import VRM, Gaussian, Loop, LSTMState, _loop, _scan
+from beliefrl.models.nets import draw, initial_statistics, standardise
+from beliefrl.models.variational_model import VRM, Gaussian, LSTMState, VRMLoopWeights, _loop, _scan
 from beliefrl.types import Timestep, UserError, Window, check_choice, time_major
 
 AGENT = VRMAgent(**SMALL)
@@ -225,16 +225,16 @@ def test_beliefs_of_means_are_without_noise_where_it_acts_and_where_it_learns(st
 
 def test_standardised_beliefs_are_what_the_controller_learns_from_and_acts_on(state):
     agent, window = dataclasses.replace(AGENT, standardise=True), windows(jax.random.key(1), 12)
-    fresh = state._replace(scale=unscaled(2 * AGENT.d_size + SPEC.obs_dim + 1))
+    fresh = state._replace(scale=initial_statistics(2 * AGENT.d_size + SPEC.obs_dim + 1))
     after, batches, _ = jax.jit(agent.begin_cycle)(fresh, window, jax.random.key(2))
     plain, others, _ = jax.jit(AGENT.begin_cycle)(state, window, jax.random.key(2))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7), after._replace(scale=None), plain)
-    np.testing.assert_allclose(batches.belief, standardised(after.scale, others.belief), rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(batches.next_belief, standardised(after.scale, others.next_belief), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(batches.belief, standardise(after.scale, others.belief), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(batches.next_belief, standardise(after.scale, others.next_belief), rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(jnp.mean(batches.belief, (0, 1)), 0, atol=1e-4)  # of the one batch that was seen
     step, mode = jax.tree.map(lambda leaf: leaf[0, 0], window.step), jnp.array(False)
     action, memory = jax.jit(agent.act)(after, agent.reset(SPEC), step, jax.random.key(3), mode)
-    belief = standardised(after.scale, jnp.concatenate([memory.first.d, memory.keep.d, step.obs, step.reward[None]]))
+    belief = standardise(after.scale, jnp.concatenate([memory.first.d, memory.keep.d, step.obs, step.reward[None]]))
     np.testing.assert_allclose(action, agent.choose(after.controller, belief, jax.random.key(3), mode), rtol=1e-5)
 
 
@@ -255,7 +255,7 @@ def test_decoding_from_the_prior_and_sums_are_other_losses(state):
 
 def test_the_loops_gradient_is_that_of_plain_differentiation():
     vrm = draw(jax.random.key(0), VRM(4, 2, 8, 4, 8))
-    weights = Loop(vrm.joint.by_d, vrm.joint.by_z, vrm.posterior_mean, vrm.posterior_sigma)
+    weights = VRMLoopWeights(vrm.joint.w_d, vrm.joint.w_z, vrm.posterior_mean, vrm.posterior_sigma)
     start = LSTMState(*jax.random.normal(jax.random.key(1), (2, 3, 8)))
     given = jax.random.normal(jax.random.key(2), (5, 3, 2 * 8 + 4 * 8))
     is_first = jnp.zeros((5, 3), bool).at[2, 1].set(True)

@@ -60,10 +60,10 @@ def vrm_from(numbers):
     others = ("features", "prior_mean", "prior_sigma", "decoder_mean", "decoder_sigma")
     return eqx.tree_at(
         lambda vrm: (
-            vrm.joint.by_d,
-            vrm.joint.by_features,
-            vrm.joint.by_action,
-            vrm.joint.by_z,
+            vrm.joint.w_d,
+            vrm.joint.w_features,
+            vrm.joint.w_action,
+            vrm.joint.w_z,
             vrm.joint.bias,
             vrm.posterior_mean,
             vrm.posterior_sigma,

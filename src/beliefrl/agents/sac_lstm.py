@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents.sac import SAC, Metrics, for_each_update, split_updates
+from beliefrl.agents.base import Metrics, SACAgent, for_each_update, split_updates
 from beliefrl.models.nets import LSTM, LSTMState, descend, draw
 from beliefrl.models.returns import transition_batch
 from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState, soft_update, update
@@ -34,7 +34,7 @@ class State(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class SACLSTMAgent(SAC):
+class SACLSTMAgent(SACAgent):
     """Soft actor-critic on an LSTM of the observations, trained end to end (Han, Doya, Tani 2020, Appendix A.2.2)."""
 
     seq_len: int = 64
@@ -155,18 +155,18 @@ class SACLSTMAgent(SAC):
 
         d_target = self.beliefs(target_lstm, windows)
         d, pullback = jax.vjp(lambda lstm: self.beliefs(lstm, windows), lstm)
-        (by_d, by_d_actor, by_controller), metrics = jax.grad(loss, (0, 1, 2), has_aux=True)(d, d, controller)
-        return (*pullback(by_d), *pullback(by_d_actor), by_controller), metrics
+        (grad_d, grad_d_actor, grad_controller), metrics = jax.grad(loss, (0, 1, 2), has_aux=True)(d, d, controller)
+        return (*pullback(grad_d), *pullback(grad_d_actor), grad_controller), metrics
 
     def update(self, state: State, batch: Window, key: Key[Array, ""]) -> tuple[State, Metrics]:
         """One update of the LSTM and the controller; the batch is windows."""
         gradients, metrics = self.gradients(state.lstm, state.target_lstm, state.controller, batch, key)
-        by_critics, by_actor, by_controller = gradients
+        grad_critics, grad_actor, grad_controller = gradients
         s_critics, s_actor = state.lstm_optimisers
-        lstm, s_critics = descend(self.lstm_optimiser, by_critics, s_critics, state.lstm)
-        lstm, s_actor = descend(self.lstm_optimiser, by_actor, s_actor, lstm)
+        lstm, s_critics = descend(self.lstm_optimiser, grad_critics, s_critics, state.lstm)
+        lstm, s_actor = descend(self.lstm_optimiser, grad_actor, s_actor, lstm)
         controller, controller_optimiser = update(
-            self.optimisers, state.controller_optimiser, state.controller, by_controller, self.tau
+            self.optimisers, state.controller_optimiser, state.controller, grad_controller, self.tau
         )
         target_lstm = soft_update(state.target_lstm, lstm, self.tau)
         return State(lstm, target_lstm, controller, (s_critics, s_actor), controller_optimiser), metrics

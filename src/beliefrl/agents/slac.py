@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents.sac import SAC, Metrics, split_updates
+from beliefrl.agents.base import Metrics, SACAgent, split_updates
 from beliefrl.models.latent_model import LatentModel, Latents, elbo_terms, predict
 from beliefrl.models.nets import Gaussian, descend, draw
 from beliefrl.models.returns import transition_batch
@@ -48,7 +48,7 @@ class State(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class SLACAgent(SAC):
+class SLACAgent(SACAgent):
     """Critics on the latent state of a learned model, an actor on the last eight observations (Lee et al. 2019)."""
 
     seq_len: int = 8
@@ -113,8 +113,10 @@ class SLACAgent(SAC):
         key_model, key_controller = jax.random.split(key)
         sizes = (spec.obs_dim, spec.action_dim, self.z1_size, self.z2_size)
         model = draw(key_model, LatentModel(*sizes, self.model_layers))
-        seen = self.history * (spec.obs_dim + 1)
-        controller, controller_optimiser = self.init_controller(key_controller, self.z2_size, spec.action_dim, seen)
+        actor_size = self.history * (spec.obs_dim + 1)
+        controller, controller_optimiser = self.init_controller(
+            key_controller, self.z2_size, spec.action_dim, actor_size
+        )
         model_optimiser = self.model_optimiser.init(model)  # pyright: ignore[reportArgumentType]
         return State(model, controller, model_optimiser, controller_optimiser)
 
@@ -145,12 +147,12 @@ class SLACAgent(SAC):
         return ("latent",)
 
     def predict(
-        self, state: State, model: str, step: Timestep, seen: Bool[Array, " time"], key: Key[Array, ""]
+        self, state: State, model: str, step: Timestep, observed: Bool[Array, " time"], key: Key[Array, ""]
     ) -> Gaussian:
         key1, key2 = jax.random.split(key)
-        time = len(seen)
+        time = len(observed)
         noise = jax.random.normal(key1, (time, self.z1_size)), jax.random.normal(key2, (time, self.z2_size))
-        return predict(state.model, perception(step), step.prev_action, seen, noise)
+        return predict(state.model, perception(step), step.prev_action, observed, noise)
 
     # Learning the model
 
@@ -194,19 +196,19 @@ class SLACAgent(SAC):
         step, burn_in, context = time_major(windows, 0, None).step, self.window.burn_in, self.history // 2
         inferred = begin_windows(time_major(windows, burn_in - context, None))
         belief = self.infer(model, inferred, key).z2[context:]
-        seen, valid = self.histories(step), transitions(windows, burn_in).T
+        actor_input, valid = self.histories(step), transitions(windows, burn_in).T
         after = time_major(windows, burn_in, None).step
-        batch = transition_batch(after, valid, belief, belief, self.n_step, self.gamma, seen)
+        batch = transition_batch(after, valid, belief, belief, self.n_step, self.gamma, actor_input)
         return split_updates(batch, self.batch_size)
 
-    def histories(self, step: Timestep) -> Float[Array, "length batch seen"]:
-        """What the actor read at each moment after the burn-in of windows (time-major)."""
+    def histories(self, step: Timestep) -> Float[Array, "length batch actor_input"]:
+        """The actor's input at each moment after the burn-in of windows (time-major)."""
         x, time = perception(step), jnp.arange(step.reward.shape[0])
         begun = jax.lax.cummax(jnp.where(step.is_first, time[:, None], 0))  # when the moment's episode began
         back = time[self.history - 1 :, None] - jnp.arange(self.history)[::-1][None]
         index = jnp.maximum(back[:, :, None], begun[self.history - 1 :, None])  # (length, history, batch)
-        seen = x[index, jnp.arange(x.shape[1])].swapaxes(1, 2)
-        return seen.reshape(*seen.shape[:2], -1)
+        actor_input = x[index, jnp.arange(x.shape[1])].swapaxes(1, 2)
+        return actor_input.reshape(*actor_input.shape[:2], -1)
 
     def update(self, state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
         controller, optimiser, metrics = self.learn_controller(state.controller, state.controller_optimiser, batch, key)

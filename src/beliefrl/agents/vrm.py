@@ -2,7 +2,7 @@
 
 Source: Section 4, Algorithm 1, Tables 1 and 2, Appendix A.1; the ablations: Appendix C. The belief is
 s_t = [d_t of the first-impression model, d_t of the keep-learning model, x_t] with x_t = (o_t, r_{t-1}). The first
-model is pre-trained once and then never changes; the second learns all the time; the controller learns on the belief
+model is pre-trained once and then never changes; the second learns throughout; the controller learns on the belief
 and sends no gradient back. In an ablation the belief has the d_t of one model, or both models are deterministic.
 
 Departures:
@@ -21,8 +21,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents.sac import SAC, Metrics, split_updates, standardise_beliefs
-from beliefrl.models.nets import Gaussian, LSTMState, Scale, descend, draw, standardised, unscaled
+from beliefrl.agents.base import Metrics, SACAgent, split_updates, standardise_beliefs
+from beliefrl.models.nets import Gaussian, LSTMState, RunningStatistics, descend, draw, initial_statistics, standardise
 from beliefrl.models.returns import transition_batch
 from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean
 from beliefrl.models.variational_model import VRM, elbo_terms, predict, prediction_error
@@ -42,7 +42,7 @@ from beliefrl.types import (
 
 
 class Memory(NamedTuple):
-    """What an actor remembers of its episode."""
+    """The recurrent states of an actor."""
 
     first: LSTMState | None
     keep: LSTMState | None
@@ -57,11 +57,11 @@ class State(NamedTuple):
     first_optimiser: optax.OptState
     keep_optimiser: optax.OptState
     controller_optimiser: OptimiserState
-    scale: Scale | None  # of beliefs, where they are standardised
+    scale: RunningStatistics | None  # of beliefs, where they are standardised
 
 
 @dataclasses.dataclass(frozen=True)
-class VRMAgent(SAC):
+class VRMAgent(SACAgent):
     """Two variational recurrent models form a belief, a soft actor-critic acts on it (Han, Doya, Tani 2020)."""
 
     # Table 2: of this agent
@@ -104,9 +104,9 @@ class VRMAgent(SAC):
     store_first_impression: bool = True
     """Keep the first-impression model's d in the replay instead of computing it again for every update."""
     sample_belief: bool = True
-    """Form beliefs with a sample of z, as the models learn; if not, with the posterior's mean: they have no noise."""
+    """Form beliefs with a sample of z, as in training the models; if False, with the posterior's mean."""
     standardise: bool = False
-    """Give the controller beliefs of mean 0 and deviation 1, by running moments: quiet entries are heard as well."""
+    """Standardise the controller's beliefs to mean 0 and deviation 1, by running statistics."""
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
@@ -129,12 +129,12 @@ class VRMAgent(SAC):
 
     @property
     def has_first(self) -> bool:
-        """Whether there is a model that stands still once it is pre-trained."""
+        """Whether there is a first-impression model, which does not change after its pre-training."""
         return self.models in ("both", "first")
 
     @property
     def has_keep(self) -> bool:
-        """Whether there is a model that learns all the time."""
+        """Whether there is a keep-learning model, which is trained throughout."""
         return self.models != "first"
 
     @property
@@ -171,7 +171,7 @@ class VRMAgent(SAC):
         controller, controller_optimiser = self.init_controller(key_controller, belief, spec.action_dim)
         models: Any = first, keep
         of_first, of_keep = map(self.model_optimiser.init, models)
-        scale = unscaled(belief) if self.standardise else None
+        scale = initial_statistics(belief) if self.standardise else None
         return State(first, keep, controller, of_first, of_keep, controller_optimiser, scale)
 
     # Acting (Figure 2b)
@@ -201,7 +201,7 @@ class VRMAgent(SAC):
             self.perceive(state.keep, memory.keep, step, key_keep, explore),
         )
         belief = jnp.concatenate([*(part.d for part in memory if part is not None), perception(step)])
-        return self.choose(state.controller, standardised(state.scale, belief), key_action, explore), memory
+        return self.choose(state.controller, standardise(state.scale, belief), key_action, explore), memory
 
     def note(self, memory: Memory) -> tuple[Float[Array, " d"], ...]:
         """d_t of the first-impression model, or nothing."""
@@ -214,11 +214,11 @@ class VRMAgent(SAC):
         return ("keep",) * self.has_keep + ("first",) * self.has_first
 
     def predict(
-        self, state: State, model: str, step: Timestep, seen: Bool[Array, " time"], key: Key[Array, ""]
+        self, state: State, model: str, step: Timestep, observed: Bool[Array, " time"], key: Key[Array, ""]
     ) -> Gaussian:
         x, keys = perception(step), jax.random.split(key)
         noise = jax.random.normal(keys[0], (len(x), self.z_size)), jax.random.normal(keys[1], x.shape)
-        return predict(getattr(state, model), x, step.prev_action, seen, noise)
+        return predict(getattr(state, model), x, step.prev_action, observed, noise)
 
     # Learning the models (Figure 2c)
 
@@ -238,7 +238,7 @@ class VRMAgent(SAC):
     def learn_model(
         self, vrm: VRM, optimiser: optax.OptState, windows: Window, key: Key[Array, ""]
     ) -> tuple[VRM, optax.OptState, Metrics]:
-        """One step up the ELBO of the windows' last `seq_len` moments but one."""
+        """One Adam step on the negative ELBO of `seq_len` moments after the burn-in."""
         grads, metrics = jax.grad(self.model_loss, has_aux=True)(vrm, windows, key)
         return *descend(self.model_optimiser, grads, optimiser, vrm), metrics
 

@@ -1,4 +1,4 @@
-"""What all agents of the paper share: the hyperparameters of Table 1, and the controller that they describe."""
+"""The base class of the agents: the hyperparameters of Table 1 and the soft actor-critic that they describe."""
 
 import dataclasses
 from typing import Any
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.models.nets import Scale, observe, standardised, tanh_gaussian
+from beliefrl.models.nets import RunningStatistics, standardise, tanh_gaussian, update_statistics
 from beliefrl.models.soft_actor_critic import (
     Batch,
     Controller,
@@ -26,8 +26,8 @@ Metrics = dict[str, Float[Array, ""]]
 
 
 @dataclasses.dataclass(frozen=True)
-class SAC:
-    """A soft actor-critic, to be given beliefs (Table 1)."""
+class SACAgent:
+    """Base class of agents whose controller is a soft actor-critic on beliefs (Table 1)."""
 
     gamma: float = 0.99
     """Discount factor γ, in [0, 1] (Table 1)."""
@@ -36,11 +36,11 @@ class SAC:
     train_interval_rl: int = 1
     """Environment steps between two updates of the controller (Table 1)."""
     updates_per_step: int = 1
-    """Updates of the controller at each of these steps (Table 1: one). More learn in fewer steps, and take longer."""
+    """Updates of the controller at each of these steps (Table 1: one). More need fewer steps and more time a step."""
     n_step: int = 1
-    """Steps of the returns that the critics learn from (the paper: one). More speed up values over a long horizon."""
+    """Steps of the critics' n-step returns (the paper: one). More propagate rewards faster over a long horizon."""
     value_start: float = 0.0
-    """What V and Q say of everything before they learn, up to noise (the paper: 0), in units of the return."""
+    """Initial output of V and Q, up to noise from the initial weights (the paper: 0), in units of the return."""
     lr_actor: float = 3e-4
     """Adam's learning rate for the actor (Table 1)."""
     lr_critic: float = 3e-4
@@ -48,7 +48,7 @@ class SAC:
     lr_alpha: float = 3e-4
     """Adam's learning rate for log α, the temperature (Table 1)."""
     target_entropy: float | None = None
-    """Entropy that α steers to; None is minus the number of actions (Table 1)."""
+    """Entropy that α aims at; None is minus the number of actions (Table 1)."""
     tau: float = 0.005
     """Fraction by which the target V moves at each update, in [0, 1] (Table 1)."""
     policy_layers: tuple[int, ...] = (256, 256)
@@ -65,7 +65,7 @@ class SAC:
         check_range(self, ("n_step",), 1, MOST_STEPS)
         check_range(self, ("value_start",), -LARGEST)
         check_range(self, ("actor_regulariser",), 0)
-        check_range(self, ("step_start_rl",), 2)  # fewer moments hold no transition to learn from
+        check_range(self, ("step_start_rl",), 2)  # fewer moments hold no transition
         check_range(self, ("lr_actor", "lr_critic", "lr_alpha", "gamma", "tau"), 0, 1)
         if self.target_entropy is not None:
             check_range(self, ("target_entropy",), -LARGEST)
@@ -88,18 +88,22 @@ class SAC:
         return Optimisers(optax.adam(self.lr_actor), optax.adam(self.lr_critic), optax.adam(self.lr_alpha))
 
     def init_controller(
-        self, key: Key[Array, ""], belief: int, action: int, seen: int | None = None
+        self, key: Key[Array, ""], belief: int, action: int, actor_size: int | None = None
     ) -> tuple[Controller, OptimiserState]:
-        """A new controller and its optimisers; `seen` is what the actor reads, where that is not the belief."""
+        """A new controller and its optimisers; `actor_size` is the actor's input size where that is not the belief."""
         sizes = belief, action, self.policy_layers, self.value_layers
-        controller = init_controller(*sizes, key, seen, self.value_start)
+        controller = init_controller(*sizes, key, actor_size, self.value_start)
         return controller, init_optimisers(self.optimisers, controller)
 
     def choose(
-        self, controller: Controller, seen: Float[Array, " seen"], key: Key[Array, ""], explore: Bool[Array, ""]
+        self,
+        controller: Controller,
+        actor_input: Float[Array, " actor_input"],
+        key: Key[Array, ""],
+        explore: Bool[Array, ""],
     ) -> Float[Array, " action"]:
         """An action: a sample of the policy, or its mode where not `explore`."""
-        mean, log_sigma = controller.actor(seen)
+        mean, log_sigma = controller.actor(actor_input)
         noise = jnp.where(explore, jax.random.normal(key, mean.shape), 0.0)
         return tanh_gaussian(mean, log_sigma, noise)[0]
 
@@ -119,12 +123,12 @@ class SAC:
         return controller, state, metrics
 
 
-def standardise_beliefs(scale: Scale | None, batch: Batch) -> tuple[Scale | None, Batch]:
+def standardise_beliefs(scale: RunningStatistics | None, batch: Batch) -> tuple[RunningStatistics | None, Batch]:
     """The scale after a batch (or those of a cycle), and the batch standardised by it; without a scale, as it is."""
     if scale is None:
         return None, batch
-    scale = observe(scale, batch.belief, batch.valid)
-    belief, next_belief = standardised(scale, batch.belief), standardised(scale, batch.next_belief)
+    scale = update_statistics(scale, batch.belief, batch.valid)
+    belief, next_belief = standardise(scale, batch.belief), standardise(scale, batch.next_belief)
     return scale, batch._replace(belief=belief, next_belief=next_belief)
 
 
