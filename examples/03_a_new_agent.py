@@ -7,8 +7,8 @@
 By then two seeds came to -750 and -495; random play gets about -1200.
 
 An agent is a frozen dataclass of hyperparameters whose methods are pure functions, for one seed and one actor; the
-training loop maps them over seeds and environments. `SACAgent` brings Table 1 of the paper and the controller; what is left
-to say is what it remembers while acting, which windows of the past it learns from, and how a belief is formed of both.
+training loop maps them over seeds and environments. `SACAgent` has Table 1 of the paper and the controller; an
+agent adds its memory while acting, the windows of the past that it learns from, and how beliefs are formed of both.
 """
 
 import dataclasses
@@ -66,6 +66,10 @@ class StackAgent(SACAgent):
     def init(self, key: Key[Array, ""], spec: Spec) -> State:
         """Networks and optimisers before training."""
         return State(*self.init_controller(key, self.stack * spec.obs_dim, spec.action_dim))
+
+    def networks(self, state: State) -> State:
+        """The state without its optimisers."""
+        return state._replace(optimiser=())
 
     def reset(self, spec: Spec) -> Float[Array, "stack obs"]:
         """The memory of an actor before its first moment."""

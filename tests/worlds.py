@@ -119,6 +119,9 @@ class CountingAgent:
     def init(self, key, spec):
         return CountingState(jnp.zeros(()), jnp.zeros((), int))
 
+    def networks(self, state):
+        return state
+
     def reset(self, spec):
         return jnp.zeros(())
 

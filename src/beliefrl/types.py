@@ -145,7 +145,6 @@ class WindowShape(NamedTuple):
 
     burn_in: int
     length: int
-    one_episode: bool = False  # windows end with their episode and overhang it, instead of going on with the next
 
 
 def transitions(window: Window, burn_in: int) -> Bool[Array, "*batch length"]:

@@ -52,6 +52,14 @@ class Agent(Protocol):
         """The state before training: networks and optimisers."""
         ...
 
+    def networks(self, state: Any) -> Any:
+        """The state without what only updates need: its optimisers' fields are replaced by ().
+
+        It is what `act` and `predict` are given outside of training, what is saved as the trained agent, and what is
+        counted as parameters. `state` may have leading axes.
+        """
+        ...
+
     def reset(self, spec: Spec) -> Any:
         """The empty memory of one actor."""
         ...

@@ -88,6 +88,10 @@ class SACLSTMAgent(SACAgent):
         lstm_optimiser = self.lstm_optimiser.init(lstm)  # pyright: ignore[reportArgumentType]
         return State(lstm, lstm, controller, (lstm_optimiser, lstm_optimiser), controller_optimiser)
 
+    def networks(self, state: State) -> State:
+        """The state without its optimisers."""
+        return state._replace(lstm_optimisers=(), controller_optimiser=())
+
     # Acting
 
     def perception(self, step: Timestep) -> Float[Array, "*batch x"]:

@@ -59,6 +59,10 @@ class SACMLPAgent(SACAgent):
         scale = initial_statistics(spec.obs_dim) if self.standardise else None
         return State(*self.init_controller(key, spec.obs_dim, spec.action_dim), scale)
 
+    def networks(self, state: State) -> State:
+        """The state without its optimisers."""
+        return state._replace(controller_optimiser=())
+
     def reset(self, spec: Spec) -> tuple[()]:
         return ()
 

@@ -120,6 +120,10 @@ class SLACAgent(SACAgent):
         model_optimiser = self.model_optimiser.init(model)  # pyright: ignore[reportArgumentType]
         return State(model, controller, model_optimiser, controller_optimiser)
 
+    def networks(self, state: State) -> State:
+        """The state without its optimisers."""
+        return state._replace(model_optimiser=(), controller_optimiser=())
+
     # Acting
 
     def reset(self, spec: Spec) -> Float[Array, "history x"]:

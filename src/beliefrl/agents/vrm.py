@@ -98,9 +98,6 @@ class VRMAgent(SACAgent):
     """Mean (the authors' code; lr_model was tuned on it) or sum (the formula) over the dimensions of z and x."""
     decode_from: Literal["posterior", "prior"] = "posterior"
     """What z is drawn from to decode x in training: the posterior (a true ELBO) or the prior (the authors' code)."""
-    windows: Literal["stream", "episode"] = "stream"
-    """Sequences drawn from the stream of all moments, in which episodes follow each other; or from one episode each,
-    which they overhang at both ends (the authors' code)."""
     store_first_impression: bool = True
     """Keep the first-impression model's d in the replay instead of computing it again for every update."""
     sample_belief: bool = True
@@ -118,7 +115,6 @@ class VRMAgent(SACAgent):
         check_choice(self, "models", ("both", "single", "first", "keep"))
         check_choice(self, "elbo_scaling", ("mean", "sum"))
         check_choice(self, "decode_from", ("posterior", "prior"))
-        check_choice(self, "windows", ("stream", "episode"))
         if self.train_interval_klvrm % self.train_interval_rl:
             raise UserError(
                 f"train_interval_klvrm={self.train_interval_klvrm} is not a multiple of "
@@ -147,7 +143,7 @@ class VRMAgent(SACAgent):
 
     @property
     def window(self) -> WindowShape:
-        return WindowShape(self.burn_in, self.seq_len, self.windows == "episode")
+        return WindowShape(self.burn_in, self.seq_len)
 
     @property
     def pretrain_windows(self) -> int:
@@ -173,6 +169,10 @@ class VRMAgent(SACAgent):
         of_first, of_keep = map(self.model_optimiser.init, models)
         scale = initial_statistics(belief) if self.standardise else None
         return State(first, keep, controller, of_first, of_keep, controller_optimiser, scale)
+
+    def networks(self, state: State) -> State:
+        """The state without its optimisers."""
+        return state._replace(first_optimiser=(), keep_optimiser=(), controller_optimiser=())
 
     # Acting (Figure 2b)
 

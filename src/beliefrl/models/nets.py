@@ -225,7 +225,7 @@ class RunningStatistics(NamedTuple):
 
     mean: Float[Array, " size"]
     variance: Float[Array, " size"]
-    count: Float[Array, ""]  # batches so far
+    batches: Float[Array, ""]  # batches so far
 
 
 STATISTICS_RATE = 1e-3  # least weight of a new batch, reached after 1 / rate batches
@@ -242,12 +242,12 @@ def update_statistics(
     statistics: RunningStatistics, x: Float[Array, "*batch size"], valid: Bool[Array, "*batch"]
 ) -> RunningStatistics:
     """Include the valid vectors of one more batch: an average over batches, exponential after 1 / STATISTICS_RATE."""
-    count = statistics.count + 1
-    rate, flat, weight = jnp.maximum(1 / count, STATISTICS_RATE), x.reshape(-1, x.shape[-1]), valid.ravel()
+    batches = statistics.batches + 1
+    rate, flat, weight = jnp.maximum(1 / batches, STATISTICS_RATE), x.reshape(-1, x.shape[-1]), valid.ravel()
     weight = weight / jnp.maximum(jnp.sum(weight), 1)
     mean = statistics.mean + rate * (weight @ flat - statistics.mean)
     variance = statistics.variance + rate * (weight @ (flat - mean[None]) ** 2 - statistics.variance)
-    return RunningStatistics(mean, variance, count)
+    return RunningStatistics(mean, variance, batches)
 
 
 def standardise(statistics: RunningStatistics | None, x: Float[Array, "*batch size"]) -> Float[Array, "*batch size"]:
