@@ -11,7 +11,7 @@ from agents.moments import SPEC, along, changed_where_missing, differ, random_li
 from beliefrl.agents.sac_lstm import SACLSTMAgent
 from beliefrl.models.nets import LSTM, LSTMState, _lstm_loop, _lstm_scan, draw
 from beliefrl.models.soft_actor_critic import actor_loss, q_loss, state_value, value_loss
-from beliefrl.types import UserError, time_major
+from beliefrl.types import UserError
 
 AGENT = SACLSTMAgent(policy_layers=(8,), value_layers=(8,), d_size=8, seq_len=6, batch_size=2, burn_in=4)
 TIME = 11
@@ -61,11 +61,11 @@ def test_the_loops_gradient_is_that_of_plain_differentiation():
 
 def test_acting_forms_the_belief_that_replay_forms(state):
     window = windows(jax.random.key(1), 1, TIME, jnp.zeros((1, TIME), bool).at[0, jnp.array([0, 5])].set(True))
-    step = time_major(window, 0, None).step
+    step = window.step
     at_once = jax.jit(lambda: state.lstm.unroll(state.lstm.start(1), AGENT.perception(step), step.is_first))()
     memory, act = AGENT.reset(SPEC), jax.jit(AGENT.act)
     for t in range(TIME):
-        moment = jax.tree.map(lambda leaf, t=t: leaf[0, t], window.step)
+        moment = jax.tree.map(lambda leaf, t=t: leaf[t, 0], window.step)
         _, memory = act(state, memory, moment, jax.random.key(t), jnp.array(False))
         np.testing.assert_allclose(memory.d, at_once.d[t, 0], rtol=1e-5, atol=1e-6)
 
@@ -78,7 +78,7 @@ def batch_of(agent, lstm, window):
 def test_batches_are_aligned_in_time(state):
     window = windows(jax.random.key(1), 2, TIME)
     batch = jax.jit(lambda: batch_of(AGENT, state.lstm, window))()
-    step = time_major(window, 0, None).step
+    step = window.step
     d = jax.jit(lambda: state.lstm.unroll(state.lstm.start(2), AGENT.perception(step), step.is_first).d)()
     for t, sequence in ((0, 0), (2, 1), (5, 1)):
         row, now = 2 * t + sequence, AGENT.burn_in + t
@@ -107,7 +107,7 @@ def frozen_losses(agent, state, window, key):
 
     def j_q(lstm):
         belief = batch_of(agent, lstm, window).belief
-        return q_loss(controller.critics, controller.target_value, ends._replace(belief=belief), agent.gamma)
+        return q_loss(controller.critics, controller.target_value, ends._replace(belief=belief))
 
     return j_pi, j_v, j_q
 
@@ -142,7 +142,7 @@ def test_the_target_lstm_is_what_the_target_value_reads(state):
 def test_no_gradient_goes_into_the_burn_in(state):
     """The weights by which the burn-in alone perceives the first input do not learn."""
     window, key = windows(jax.random.key(1), 2, TIME), jax.random.key(2)
-    obs = window.step.obs.at[:, AGENT.burn_in :, 0].set(0.0)
+    obs = window.step.obs.at[AGENT.burn_in :, :, 0].set(0.0)
     window = window._replace(step=window.step._replace(obs=obs))
     grad_critics, grad_actor, _ = jax.jit(AGENT.gradients)(state.lstm, state.lstm, state.controller, window, key)[0]
     for gradient in (grad_critics, grad_actor):

@@ -152,10 +152,11 @@ def update(sac_numbers):
     batch = Batch(
         *(jnp.array(sac_numbers[name]) for name in ("belief", "next_belief", "action", "reward")),
         terminated=jnp.array(sac_numbers["terminated"] > 0),
+        discount=jnp.full(11, float(sac_numbers["gamma"])),
         valid=jnp.ones(11, bool),
     )
     return controller, jax.grad(loss, has_aux=True)(
-        controller, batch, jnp.array(sac_numbers["noise"]), gamma=float(sac_numbers["gamma"]), regulariser=1e-3
+        controller, batch, jnp.array(sac_numbers["noise"]), regulariser=1e-3
     )
 
 

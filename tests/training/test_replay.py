@@ -43,8 +43,8 @@ def test_windows_are_the_newest_moments_in_order(firsts, capacity, shape):
     replay = filled(capacity, firsts)
     stored = np.arange(len(firsts))[-capacity:]
     window = sample(replay, jax.random.key(0), 8, shape)
-    numbers, exists = np.array(window.note[0]), np.array(window.exists)
-    for row, there, is_first in zip(numbers, exists, np.array(window.step.is_first), strict=True):
+    numbers, exists = np.array(window.note[0]).T, np.array(window.exists).T
+    for row, there, is_first in zip(numbers, exists, np.array(window.step.is_first).T, strict=True):
         seen = row[there].astype(int)
         assert len(seen) > 0
         np.testing.assert_array_equal(np.diff(seen), 1)
@@ -62,7 +62,7 @@ def test_exactly_the_transitions_within_episodes_can_be_drawn(firsts, capacity):
     expected = {n for n in stored[:-1] if not firsts[n + 1]}
     window = sample(replay, jax.random.key(1), 600, shape)
     valid = np.array(transitions(window, shape.burn_in))
-    now = np.array(window.note[0])[:, shape.burn_in : -1]
+    now = np.array(window.note[0])[shape.burn_in : -1]
     assert set(now[valid].astype(int)) == expected
 
 
@@ -76,7 +76,7 @@ def test_a_masked_addition_leaves_the_ring_alone():
 def test_starts_are_uniform():
     shape, count = WindowShape(2, 4), 30
     window = sample(filled(64, np.zeros(count, bool)), jax.random.key(2), 20_000, shape)
-    starts = np.array(window.note[0])[:, shape.burn_in].astype(int)
+    starts = np.array(window.note[0])[shape.burn_in].astype(int)
     drawn = np.bincount(starts, minlength=count)
     possible = count - shape.length
     assert set(np.flatnonzero(drawn)) == set(range(possible))

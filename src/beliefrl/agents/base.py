@@ -9,6 +9,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.models.nets import RunningStatistics, standardise, tanh_gaussian, update_statistics
+from beliefrl.models.returns import transition_batch
 from beliefrl.models.soft_actor_critic import (
     Batch,
     Controller,
@@ -19,7 +20,7 @@ from beliefrl.models.soft_actor_critic import (
     loss,
     update,
 )
-from beliefrl.types import LARGEST, WIDEST, check_choice, check_range
+from beliefrl.types import LARGEST, WIDEST, Window, WindowShape, check_choice, check_range, transitions
 
 MOST_STEPS = 64  # of a return; each is compiled
 Metrics = dict[str, Float[Array, ""]]
@@ -84,6 +85,11 @@ class SACAgent:
         return self.train_interval_rl
 
     @property
+    def window(self) -> WindowShape:
+        """The windows that the agent learns from."""
+        raise NotImplementedError
+
+    @property
     def optimisers(self) -> Optimisers:
         return Optimisers(optax.adam(self.lr_actor), optax.adam(self.lr_critic), optax.adam(self.lr_alpha))
 
@@ -112,7 +118,27 @@ class SACAgent:
     ) -> tuple[Float[Array, ""], Metrics]:
         """The four losses of soft actor-critic, summed; and what to log."""
         noise = jax.random.normal(key, batch.action.shape)
-        return loss(controller, batch, noise, self.gamma, self.actor_regulariser, self.target_entropy)
+        return loss(controller, batch, noise, self.actor_regulariser, self.target_entropy)
+
+    def transitions(
+        self,
+        windows: Window,
+        belief: Float[Array, "time batch belief"],
+        next_belief: Float[Array, "time batch belief"] | None = None,
+        actor_input: Float[Array, "time batch actor_input"] | None = None,
+    ) -> Batch:
+        """The transitions of windows after the burn-in, with returns of `n_step` steps; leaves (length, batch, ...).
+
+        Args:
+            windows: as the replay returns them.
+            belief: at the length + 1 moments after the burn-in.
+            next_belief: what V̄ reads at these moments; None: `belief`.
+            actor_input: what the actor reads there; None: `belief`.
+        """
+        burn_in = self.window.burn_in
+        after = belief if next_belief is None else next_belief
+        step, valid = windows.between(burn_in, None).step, transitions(windows, burn_in)
+        return transition_batch(step, valid, belief, after, self.n_step, self.gamma, actor_input)
 
     def learn_controller(
         self, controller: Controller, state: OptimiserState, batch: Batch, key: Key[Array, ""]
@@ -133,16 +159,10 @@ def standardise_beliefs(scale: RunningStatistics | None, batch: Batch) -> tuple[
 
 
 def for_each_update(windows: Any, count: int) -> Any:
-    """(update · count, ...) to (update, count, ...): a cycle's windows, or what is made of them, for each update."""
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, count, *leaf.shape[1:]), windows)
+    """A cycle's windows for each of its updates: (time, update · count, ...) to (update, time, count, ...)."""
+    return jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0], -1, count, *leaf.shape[2:]).swapaxes(0, 1), windows)
 
 
-def split_updates(moments: Any, windows: int) -> Any:
-    """(time, update · windows, ...) to (update, time · windows, ...): a cycle's moments for each of its updates."""
-
-    def split(leaf: Array) -> Array:
-        time, both, *rest = leaf.shape
-        leaf = leaf.reshape(time, both // windows, windows, *rest).swapaxes(0, 1)
-        return leaf.reshape(both // windows, time * windows, *rest)
-
-    return jax.tree.map(split, moments)
+def split_updates(batch: Any, count: int) -> Any:
+    """A cycle's transitions for each of its updates: (time, update · count, ...) to (update, time · count, ...)."""
+    return jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0], -1, *leaf.shape[3:]), for_each_update(batch, count))

@@ -18,9 +18,8 @@ from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents.base import Metrics, SACAgent, for_each_update, split_updates
 from beliefrl.models.nets import LSTM, LSTMState, descend, draw
-from beliefrl.models.returns import transition_batch
 from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState, soft_update, update
-from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range, time_major, transitions
+from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range
 
 
 class State(NamedTuple):
@@ -128,7 +127,7 @@ class SACLSTMAgent(SACAgent):
 
     def beliefs(self, lstm: LSTM, windows: Window) -> Float[Array, "time batch d"]:
         """d_t from the end of the burn-in on; no gradient goes into the burn-in."""
-        before, after = time_major(windows, 0, self.burn_in), time_major(windows, self.burn_in, None)
+        before, after = windows.between(0, self.burn_in), windows.between(self.burn_in, None)
         start = lstm.start(self.batch_size)
         if self.burn_in:
             still = jax.lax.stop_gradient(lstm)
@@ -144,9 +143,7 @@ class SACLSTMAgent(SACAgent):
         d_target: Float[Array, "time batch d"],
     ) -> Batch:
         """The windows' transitions, with beliefs for the critics, for the actor (the same numbers) and for V̄."""
-        step = time_major(windows, self.burn_in, None).step
-        valid = transitions(windows, self.burn_in).T
-        batch = transition_batch(step, valid, d, d_target, self.n_step, self.gamma, d_actor)
+        batch = self.transitions(windows, d, d_target, d_actor)
         return jax.tree.map(lambda leaf: leaf[0], split_updates(batch, self.batch_size))
 
     def gradients(

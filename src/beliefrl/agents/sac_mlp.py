@@ -10,11 +10,10 @@ from typing import NamedTuple
 import jax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents.base import Metrics, SACAgent, for_each_update, standardise_beliefs
+from beliefrl.agents.base import Metrics, SACAgent, split_updates, standardise_beliefs
 from beliefrl.models.nets import RunningStatistics, initial_statistics, standardise
-from beliefrl.models.returns import transition_batch
 from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState
-from beliefrl.types import Spec, Timestep, Window, WindowShape, check_range, time_major, transitions
+from beliefrl.types import Spec, Timestep, Window, WindowShape, check_range
 
 
 class State(NamedTuple):
@@ -81,13 +80,15 @@ class SACMLPAgent(SACAgent):
     def begin_cycle(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Batch, Metrics]:
         """The batch of each update."""
         scale, batch = standardise_beliefs(state.scale, self.batch(windows))
-        return state._replace(scale=scale), for_each_update(batch, self.batch_size), {}
+        return (
+            state._replace(scale=scale),
+            split_updates(jax.tree.map(lambda leaf: leaf[None], batch), self.batch_size),
+            {},
+        )
 
     def batch(self, windows: Window) -> Batch:
         """The windows' first transitions."""
-        step, valid = time_major(windows, 0, None).step, transitions(windows, 0).T
-        batch = transition_batch(step, valid, step.obs, step.obs, self.n_step, self.gamma)
-        return jax.tree.map(lambda leaf: leaf[0], batch)
+        return jax.tree.map(lambda leaf: leaf[0], self.transitions(windows, windows.step.obs))
 
     def update(self, state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
         controller, optimiser, metrics = self.learn_controller(state.controller, state.controller_optimiser, batch, key)

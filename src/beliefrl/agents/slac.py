@@ -21,7 +21,6 @@ from jaxtyping import Array, Bool, Float, Key
 from beliefrl.agents.base import Metrics, SACAgent, split_updates
 from beliefrl.models.latent_model import LatentModel, Latents, elbo_terms, predict
 from beliefrl.models.nets import Gaussian, descend, draw
-from beliefrl.models.returns import transition_batch
 from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean
 from beliefrl.types import (
     WIDEST,
@@ -33,8 +32,6 @@ from beliefrl.types import (
     check_choice,
     check_range,
     perception,
-    time_major,
-    transitions,
 )
 
 
@@ -167,7 +164,7 @@ class SLACAgent(SACAgent):
 
     def model_loss(self, model: LatentModel, windows: Window, key: Key[Array, ""]) -> tuple[Float[Array, ""], Metrics]:
         """The negative ELBO, mean over the valid moments of the sequences."""
-        moments = begin_windows(time_major(windows, self.history - 1, -1))
+        moments = begin_windows(windows.between(self.history - 1, -1))
         step = moments.step
         latents = self.infer(model, moments, key)
         terms = elbo_terms(model, latents, step.obs, step.reward, step.prev_action, step.is_first)
@@ -189,20 +186,18 @@ class SLACAgent(SACAgent):
 
     def begin_cycle(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Batch, Metrics]:
         key_model, key_belief = jax.random.split(key)
-        for_model = jax.tree.map(lambda leaf: leaf[: self.batch_size], windows)
-        for_controller = jax.tree.map(lambda leaf: leaf[self.batch_size :], windows)
+        for_model = jax.tree.map(lambda leaf: leaf[:, : self.batch_size], windows)
+        for_controller = jax.tree.map(lambda leaf: leaf[:, self.batch_size :], windows)
         batches = self.batches(state.model, for_controller, key_belief)
         state, metrics = self.pretrain(state, for_model, key_model)
         return state, batches, metrics
 
     def batches(self, model: LatentModel, windows: Window, key: Key[Array, ""]) -> Batch:
         """The windows' transitions with their beliefs, split for a cycle's updates: leaves (update, batch, ...)."""
-        step, burn_in, context = time_major(windows, 0, None).step, self.window.burn_in, self.history // 2
-        inferred = begin_windows(time_major(windows, burn_in - context, None))
+        burn_in, context = self.window.burn_in, self.history // 2
+        inferred = begin_windows(windows.between(burn_in - context, None))
         belief = self.infer(model, inferred, key).z2[context:]
-        actor_input, valid = self.histories(step), transitions(windows, burn_in).T
-        after = time_major(windows, burn_in, None).step
-        batch = transition_batch(after, valid, belief, belief, self.n_step, self.gamma, actor_input)
+        batch = self.transitions(windows, belief, actor_input=self.histories(windows.step))
         return split_updates(batch, self.batch_size)
 
     def histories(self, step: Timestep) -> Float[Array, "length batch actor_input"]:

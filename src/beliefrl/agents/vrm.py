@@ -23,7 +23,6 @@ from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents.base import Metrics, SACAgent, split_updates, standardise_beliefs
 from beliefrl.models.nets import Gaussian, LSTMState, RunningStatistics, descend, draw, initial_statistics, standardise
-from beliefrl.models.returns import transition_batch
 from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean
 from beliefrl.models.variational_model import VRM, elbo_terms, predict, prediction_error
 from beliefrl.types import (
@@ -36,8 +35,6 @@ from beliefrl.types import (
     check_choice,
     check_range,
     perception,
-    time_major,
-    transitions,
 )
 
 
@@ -245,7 +242,7 @@ class VRMAgent(SACAgent):
     def model_loss(self, vrm: VRM, windows: Window, key: Key[Array, ""]) -> tuple[Float[Array, ""], Metrics]:
         """The negative ELBO (the squared error of deterministic models), mean over the valid moments after burn-in."""
         key_burn_in, key_infer, key_prior = jax.random.split(key, 3)
-        before, after = time_major(windows, 0, self.burn_in), time_major(windows, self.burn_in, -1)
+        before, after = windows.between(0, self.burn_in), windows.between(self.burn_in, -1)
         start = vrm.start(self.batch_size)
         if self.burn_in:
             noise = self.noise(key_burn_in, before)
@@ -277,25 +274,23 @@ class VRMAgent(SACAgent):
     def begin_cycle(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Batch, Metrics]:
         key_model, key_belief = jax.random.split(key)
         count = self.batch_size * self.has_keep
-        for_model = jax.tree.map(lambda leaf: leaf[:count], windows)
-        for_controller = jax.tree.map(lambda leaf: leaf[count:], windows)
+        for_model = jax.tree.map(lambda leaf: leaf[:, :count], windows)
+        for_controller = jax.tree.map(lambda leaf: leaf[:, count:], windows)
         state, metrics = self.learn_keep(state, for_model, key_model)
         scale, batches = standardise_beliefs(state.scale, self.batches(state, for_controller, key_belief))
         return state._replace(scale=scale), batches, metrics
 
     def batches(self, state: State, windows: Window, key: Key[Array, ""]) -> Batch:
         """The windows' transitions with their beliefs, split for a cycle's updates: leaves (update, batch, ...)."""
-        moments = time_major(windows, 0, None)
-        of_first, of_keep = (self.noise(k, moments, self.sample_belief) for k in jax.random.split(key))
-        parts = [perception(moments.step)]
+        of_first, of_keep = (self.noise(k, windows, self.sample_belief) for k in jax.random.split(key))
+        parts = [perception(windows.step)]
         if state.keep is not None:
-            parts.insert(0, self.unroll(state.keep, moments, of_keep).d)
+            parts.insert(0, self.unroll(state.keep, windows, of_keep).d)
         if state.first is not None:
             stored = self.store_first_impression
-            parts.insert(0, moments.note[0] if stored else self.unroll(state.first, moments, of_first).d)
-        belief, step = jnp.concatenate(parts, axis=-1)[self.burn_in :], time_major(windows, self.burn_in, None).step
-        valid = transitions(windows, self.burn_in).T
-        return split_updates(transition_batch(step, valid, belief, belief, self.n_step, self.gamma), self.batch_size)
+            parts.insert(0, windows.note[0] if stored else self.unroll(state.first, windows, of_first).d)
+        belief = jnp.concatenate(parts, axis=-1)[self.burn_in :]
+        return split_updates(self.transitions(windows, belief), self.batch_size)
 
     def update(self, state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
         controller, optimiser, metrics = self.learn_controller(state.controller, state.controller_optimiser, batch, key)

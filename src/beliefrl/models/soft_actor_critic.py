@@ -79,9 +79,9 @@ class Batch(NamedTuple):
     action: Float[Array, "batch action"]  # a_t
     reward: Float[Array, " batch"]  # r_t, or the discounted sum of m of them
     terminated: Bool[Array, " batch"]  # `next_belief` is terminal
+    discount: Float[Array, " batch"]  # γ^m of the value at `next_belief`
     valid: Bool[Array, " batch"]  # mask: False entries are ignored
     actor_input: Float[Array, "batch actor_input"] | None = None  # the actor's input where that is not s_t (SLAC)
-    discount: Float[Array, " batch"] | None = None  # γ^m of what lies beyond; None: γ
 
 
 def init_controller(
@@ -121,11 +121,10 @@ def value_loss(
     return valid_mean(0.5 * (state_value(value, belief) - target) ** 2, valid)
 
 
-def q_loss(critics: tuple[MLP, MLP], target_value: MLP, batch: Batch, gamma: float) -> Float[Array, ""]:
+def q_loss(critics: tuple[MLP, MLP], target_value: MLP, batch: Batch) -> Float[Array, ""]:
     """J_Q of both critics, summed."""
-    discount = gamma if batch.discount is None else batch.discount
     next_value = jnp.where(batch.terminated, 0.0, state_value(target_value, batch.next_belief))
-    target = jax.lax.stop_gradient(batch.reward + discount * next_value)
+    target = jax.lax.stop_gradient(batch.reward + batch.discount * next_value)
     errors = [q_value(critic, batch.belief, batch.action) - target for critic in critics]
     return valid_mean(0.5 * errors[0] ** 2 + 0.5 * errors[1] ** 2, batch.valid)
 
@@ -153,7 +152,6 @@ def loss(
     controller: Controller,
     batch: Batch,
     noise: Float[Array, "batch action"],
-    gamma: float,
     regulariser: float,
     target_entropy: float | None = None,
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
@@ -168,7 +166,7 @@ def loss(
     q, log_prob = jax.lax.stop_gradient(extras)
     alpha = jnp.exp(fixed.log_alpha)
     j_v = value_loss(controller.value, batch.belief, q - alpha * log_prob, batch.valid)
-    j_q = q_loss(controller.critics, fixed.target_value, batch, gamma)
+    j_q = q_loss(controller.critics, fixed.target_value, batch)
     target_entropy = -float(batch.action.shape[-1]) if target_entropy is None else target_entropy
     j_alpha = alpha_loss(controller.log_alpha, log_prob, batch.valid, target_entropy)
     metrics = {

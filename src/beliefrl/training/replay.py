@@ -38,7 +38,7 @@ def add(replay: Replay, moment: StoredTimestep, keep: Bool[Array, ""] | bool = T
 
 
 def sample(replay: Replay, key: Key[Array, ""], batch: int, shape: WindowShape) -> Window:
-    """Draw `batch` windows of burn_in + length + 1 moments, leaves (batch, time, ...).
+    """Draw `batch` windows of burn_in + length + 1 moments, leaves (time, batch, ...).
 
     The first transition after the burn-in is uniform over all starts whose `length` transitions are stored, so
     every stored transition can be drawn. The burn-in overhangs where too little lies before it; with fewer moments
@@ -46,8 +46,8 @@ def sample(replay: Replay, key: Key[Array, ""], batch: int, shape: WindowShape) 
     """
     oldest = jnp.maximum(replay.added - capacity(replay), 0)
     stored = replay.added - oldest
-    start = jax.random.randint(key, (batch, 1), 0, jnp.maximum(stored - shape.length, 1))
-    position = start + jnp.arange(-shape.burn_in, shape.length + 1)[None]  # 0 is the oldest moment
+    start = jax.random.randint(key, (batch, 1), 0, jnp.maximum(stored - shape.length, 1)).T
+    position = start + jnp.arange(-shape.burn_in, shape.length + 1)[:, None]  # 0 is the oldest moment
     moments = gather(replay, oldest + position)
     step = moments.step._replace(is_first=moments.step.is_first | (position <= 0))
     return Window(step, moments.note, (position >= 0) & (position < stored))
