@@ -7,8 +7,8 @@
 By then two seeds came to -750 and -495; random play gets about -1200.
 
 An agent is a frozen dataclass of hyperparameters whose methods are pure functions, for one seed and one actor; the
-training loop maps them over seeds and environments. `SAC` brings Table 1 of the paper and the controller; what is left
-to say is what it remembers while acting, which windows of the past it learns from, and how a belief is formed of both.
+training loop maps them over seeds and environments. `SACAgent` has Table 1 of the paper and the controller; an
+agent adds its memory while acting, the windows of the past that it learns from, and how beliefs are formed of both.
 """
 
 import dataclasses
@@ -20,9 +20,9 @@ import tyro
 from jaxtyping import Array, Bool, Float, Key
 
 import beliefrl
-from beliefrl.agents.sac import SAC, Metrics
+from beliefrl.agents.base import Metrics, SACAgent, split_updates
 from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState
-from beliefrl.types import Spec, Timestep, Window, WindowShape, transitions
+from beliefrl.types import Spec, Timestep, Window, WindowShape
 
 
 class State(NamedTuple):
@@ -33,7 +33,7 @@ class State(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class StackAgent(SAC):
+class StackAgent(SACAgent):
     """Soft actor-critic on the last `stack` observations; before an episode's first, on copies of it."""
 
     stack: int = 3
@@ -44,14 +44,9 @@ class StackAgent(SAC):
     """Updates at step_start_rl, as many as the paper's agents make."""
 
     @property
-    def cycle(self) -> int:
-        """Steps between two visits to the replay."""
-        return self.train_interval_rl
-
-    @property
     def window(self) -> WindowShape:
-        """A transition, and what must be seen before it."""
-        return WindowShape(burn_in=self.stack - 1, length=1)
+        """A transition of `n_step` steps, and what must be seen before it."""
+        return WindowShape(burn_in=self.stack - 1, length=self.n_step)
 
     @property
     def pretrain_windows(self) -> int:
@@ -60,12 +55,16 @@ class StackAgent(SAC):
 
     @property
     def cycle_windows(self) -> int:
-        """Windows in a cycle, which has one update."""
-        return self.batch_size
+        """Windows in a cycle: a batch for each of its updates."""
+        return self.batch_size * self.cycle_updates
 
     def init(self, key: Key[Array, ""], spec: Spec) -> State:
         """Networks and optimisers before training."""
         return State(*self.init_controller(key, self.stack * spec.obs_dim, spec.action_dim))
+
+    def networks(self, state: State) -> State:
+        """The state without its optimisers."""
+        return state._replace(optimiser=())
 
     def reset(self, spec: Spec) -> Float[Array, "stack obs"]:
         """The memory of an actor before its first moment."""
@@ -88,37 +87,31 @@ class StackAgent(SAC):
         """What the replay keeps beside the moment: nothing."""
         return ()
 
-    def stacks(self, window: Window) -> Float[Array, "time belief"]:
-        """The beliefs at every moment of one window, by the same memory as in acting."""
-        begins = window.step.is_first | ~window.exists
+    def stacks(self, windows: Window) -> Float[Array, "time batch belief"]:
+        """The beliefs at every moment of windows, by the same memory as in acting."""
+        begins = windows.step.is_first | ~windows.exists
 
         def perceive(memory, moment):
             obs, first = moment
-            memory = jnp.concatenate([jnp.where(first, jnp.broadcast_to(obs, memory.shape), memory)[1:], obs[None]])
-            return memory, memory.reshape(-1)
+            older = jnp.where(first[:, None, None], jnp.broadcast_to(obs[:, None], memory.shape), memory)
+            memory = jnp.concatenate([older[:, 1:], obs[:, None]], axis=1)
+            return memory, memory.reshape(len(memory), -1)
 
-        empty = jnp.zeros((self.stack, window.step.obs.shape[-1]))
-        return jax.lax.scan(perceive, empty, (window.step.obs, begins))[1]
+        _, batch, obs = windows.step.obs.shape
+        return jax.lax.scan(perceive, jnp.zeros((batch, self.stack, obs)), (windows.step.obs, begins))[1]
 
-    def batch(self, windows: Window) -> Batch:
-        """The last transition of every window."""
-        step, beliefs = windows.step, jax.vmap(self.stacks)(windows)
-        return Batch(
-            belief=beliefs[:, -2],
-            next_belief=beliefs[:, -1],
-            action=step.prev_action[:, -1],
-            reward=step.reward[:, -1],
-            terminated=step.terminated[:, -1],
-            valid=transitions(windows, self.stack - 1)[:, 0],
-        )
+    def batches(self, windows: Window) -> Batch:
+        """The first transition of every window, split for a cycle's updates: leaves (update, batch, ...)."""
+        transitions = self.transitions(windows, self.stacks(windows)[self.stack - 1 :])
+        return split_updates(jax.tree.map(lambda leaf: leaf[:1], transitions), self.batch_size)
 
     def pretrain(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Metrics]:
         """One update of the pre-training."""
-        return self.update(state, self.batch(windows), key)
+        return self.update(state, jax.tree.map(lambda leaf: leaf[0], self.batches(windows)), key)
 
     def begin_cycle(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Batch, Metrics]:
-        """The batches of the cycle's updates, here one."""
-        return state, jax.tree.map(lambda leaf: leaf[None], self.batch(windows)), {}
+        """The batch of each update."""
+        return state, self.batches(windows), {}
 
     def update(self, state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
         """One update of the controller."""

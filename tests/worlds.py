@@ -119,6 +119,9 @@ class CountingAgent:
     def init(self, key, spec):
         return CountingState(jnp.zeros(()), jnp.zeros((), int))
 
+    def networks(self, state):
+        return state
+
     def reset(self, spec):
         return jnp.zeros(())
 
@@ -133,9 +136,9 @@ class CountingAgent:
         step, obs = window.step, window.step.obs[..., 0]
         valid = transitions(window, self.window.burn_in)
         now, after = slice(self.window.burn_in, -1), slice(self.window.burn_in + 1, None)
-        wrong = obs[:, after] != obs[:, now] + 1
-        wrong |= step.reward[:, after] != obs[:, after]
-        wrong |= step.terminated[:, now]
+        wrong = obs[after] != obs[now] + 1
+        wrong |= step.reward[after] != obs[after]
+        wrong |= step.terminated[now]
         broken = jnp.sum(wrong & valid) + jnp.sum((window.note[0] != obs) & window.exists)
         return {"broken": broken.astype(float), "valid": jnp.sum(valid).astype(float)}
 
@@ -143,7 +146,7 @@ class CountingAgent:
         return state._replace(offset=state.offset + 1), self.check(windows)
 
     def begin_cycle(self, state, windows, key):
-        batches = jax.tree.map(lambda leaf: leaf.reshape(2, 4, *leaf.shape[1:]), windows)
+        batches = jax.tree.map(lambda leaf: leaf.reshape(len(leaf), 2, 4, *leaf.shape[2:]).swapaxes(0, 1), windows)
         return state, batches, {}
 
     def update(self, state, batch, key):

@@ -133,11 +133,15 @@ class StoredTimestep(NamedTuple):
 
 
 class Window(NamedTuple):
-    """Moments in a row as the replay returns them; is_first is also set at the oldest moment that exists."""
+    """Windows of consecutive moments as the replay returns them; is_first is also set at the oldest stored moment."""
 
-    step: Timestep  # leaves (batch, time, ...)
+    step: Timestep  # leaves (time, batch, ...)
     note: Any
-    exists: Bool[Array, "*batch time"]  # False where the window overhangs what is stored
+    exists: Bool[Array, "time *batch"]  # False where the window overhangs what is stored
+
+    def between(self, start: int, stop: int | None) -> "Window":
+        """The moments from `start` to `stop`, as slices count them."""
+        return jax.tree.map(lambda leaf: leaf[start:stop], self)
 
 
 class WindowShape(NamedTuple):
@@ -145,15 +149,9 @@ class WindowShape(NamedTuple):
 
     burn_in: int
     length: int
-    one_episode: bool = False  # windows end with their episode and overhang it, instead of going on with the next
 
 
-def transitions(window: Window, burn_in: int) -> Bool[Array, "*batch length"]:
-    """Which pairs of neighbours after the burn-in are transitions; (..., time) gives (..., time - burn_in - 1)."""
-    now, after = window.exists[..., burn_in:-1], window.exists[..., burn_in + 1 :]
-    return now & after & ~window.step.is_first[..., burn_in + 1 :]
-
-
-def time_major(window: Window, start: int, stop: int | None) -> Window:
-    """The moments from `start` to `stop` of windows (batch, time, ...) as (time, batch, ...)."""
-    return jax.tree.map(lambda leaf: leaf[:, start:stop].swapaxes(0, 1), window)
+def transitions(window: Window, burn_in: int) -> Bool[Array, "length *batch"]:
+    """Which neighbours after the burn-in are transitions; (time, ...) gives (time - burn_in - 1, ...)."""
+    now, after = window.exists[burn_in:-1], window.exists[burn_in + 1 :]
+    return now & after & ~window.step.is_first[burn_in + 1 :]

@@ -20,7 +20,10 @@ SMALL = {  # VRM
 
 
 def windows(key, batch, time, is_first=None, exists=None):
-    """Random windows of `time` moments that begin at an episode's first, where nothing else is said."""
+    """Random windows of `time` moments that begin at an episode's first, where nothing else is said.
+
+    `is_first` and `exists` are (batch, time), what is returned (time, batch, ...).
+    """
     keys = jax.random.split(key, 3)
     none = jnp.zeros((batch, time), bool)
     is_first = none.at[:, 0].set(True) if is_first is None else is_first
@@ -32,7 +35,8 @@ def windows(key, batch, time, is_first=None, exists=None):
         is_first,
         none,
     )
-    return Window(step, (), ~none if exists is None else exists)
+    window = Window(step, (), ~none if exists is None else exists)
+    return jax.tree.map(lambda leaf: leaf.swapaxes(0, 1), window)
 
 
 def same(a, b):
@@ -48,6 +52,7 @@ def differ(a, b):
 def changed_where_missing(agent, state, window, exists):
     """What a cycle and its updates make of windows, and of the same with other moments where none exist."""
     other = windows(jax.random.key(9), *exists.shape)
+    exists = exists.T
     changed = jax.tree.map(
         lambda a, b: jnp.where(exists.reshape(exists.shape + (1,) * (a.ndim - 2)), a, b),
         window._replace(exists=exists),

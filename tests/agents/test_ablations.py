@@ -9,7 +9,7 @@ import pytest
 
 from agents.moments import SMALL, SPEC, along, random_like, same, slope, windows
 from beliefrl import agents
-from beliefrl.types import UserError, perception, time_major
+from beliefrl.types import UserError, perception
 
 MODELS = {"vrm": "first keep", "vrm-single": "keep", "vrm-first": "first", "vrm-keep": "keep"}
 
@@ -34,7 +34,7 @@ def test_it_has_its_models_and_each_learns_in_its_time(name):
     assert (agent.pretrain_updates > 0) == (name != "vrm-keep")
 
     if agent.pretrain_updates:
-        part = jax.tree.map(lambda leaf: leaf[:2], window)
+        part = jax.tree.map(lambda leaf: leaf[:, :2], window)
         after, metrics = jax.jit(agent.pretrain)(state, part, jax.random.key(2))
         learned = [part for part in ("first", "keep") if not same(getattr(after, part), getattr(state, part))]
         assert learned == there[:1]
@@ -52,11 +52,11 @@ def test_acting_forms_the_belief_that_replay_forms(name):
     agent, state, window = made(name)
     agent = dataclasses.replace(agent, store_first_impression=False, deterministic=True)
     state = jax.jit(lambda key: agent.init(key, SPEC))(jax.random.key(0))
-    windowed = jax.tree.map(lambda leaf: leaf[:10], window)._replace(note=())
+    windowed = jax.tree.map(lambda leaf: leaf[:, :10], window)._replace(note=())
     batch = jax.jit(agent.batches)(state, windowed, jax.random.key(2))
     memory, act = agent.reset(SPEC), jax.jit(agent.act)
     for t in range(11):
-        step = jax.tree.map(lambda leaf, t=t: leaf[0, t], windowed.step)
+        step = jax.tree.map(lambda leaf, t=t: leaf[t, 0], windowed.step)
         _, memory = act(state, memory, step, jax.random.key(t), jnp.array(True))
         if t == agent.burn_in:
             d = (memory.first or memory.keep).d
@@ -71,7 +71,7 @@ def deterministic():
 def test_a_deterministic_model_predicts_before_it_sees(deterministic):
     """z_t and the prediction of x_t come from d_{t-1} and a_{t-1}; x_t enters d_t. No key changes anything."""
     _, state, window = deterministic
-    moments = time_major(window, 0, None)
+    moments = window
     changed = moments.step._replace(obs=moments.step.obs.at[5].add(1.0))
 
     @jax.jit
@@ -89,8 +89,8 @@ def test_a_deterministic_model_predicts_before_it_sees(deterministic):
 
 def test_a_deterministic_models_loss_is_its_mean_squared_error(deterministic):
     agent, state, window = deterministic
-    window = jax.tree.map(lambda leaf: leaf[:2], window)
-    vrm, moments = state.keep, time_major(window, 0, -1)
+    window = jax.tree.map(lambda leaf: leaf[:, :2], window)
+    vrm, moments = state.keep, window.between(0, -1)
     step = moments.step
 
     @jax.jit
@@ -109,7 +109,7 @@ def test_a_deterministic_models_loss_is_its_mean_squared_error(deterministic):
 def test_a_deterministic_models_gradient_agrees_with_finite_differences(deterministic):
     agent, state, window = deterministic
     agent = dataclasses.replace(agent, burn_in=0, seq_len=10)
-    window = jax.tree.map(lambda leaf: leaf[:2], window)
+    window = jax.tree.map(lambda leaf: leaf[:, :2], window)
     loss = jax.jit(lambda vrm: agent.model_loss(vrm, window, jax.random.key(2))[0])
     direction = random_like(state.keep, jax.random.key(3))
     gradient = jax.jit(jax.grad(loss))(state.keep)

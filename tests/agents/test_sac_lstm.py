@@ -11,7 +11,7 @@ from agents.moments import SPEC, along, changed_where_missing, differ, random_li
 from beliefrl.agents.sac_lstm import SACLSTMAgent
 from beliefrl.models.nets import LSTM, LSTMState, _lstm_loop, _lstm_scan, draw
 from beliefrl.models.soft_actor_critic import actor_loss, q_loss, state_value, value_loss
-from beliefrl.types import UserError, time_major
+from beliefrl.types import UserError
 
 AGENT = SACLSTMAgent(policy_layers=(8,), value_layers=(8,), d_size=8, seq_len=6, batch_size=2, burn_in=4)
 TIME = 11
@@ -35,7 +35,7 @@ def test_the_lstm_is_the_textbooks():
     d, c = np.zeros((2, 4)), np.zeros((2, 4))
     for t in range(5):
         d, c = (np.where(is_first[t][:, None], 0.0, part) for part in (d, c))
-        i, f, g, o = np.split(x[t] @ np.asarray(lstm.by_x) + d @ np.asarray(lstm.by_d) + np.asarray(lstm.bias), 4, -1)
+        i, f, g, o = np.split(x[t] @ np.asarray(lstm.w_x) + d @ np.asarray(lstm.w_d) + np.asarray(lstm.bias), 4, -1)
         c = sigmoid(f) * c + sigmoid(i) * np.tanh(g)
         d = sigmoid(o) * np.tanh(c)
         np.testing.assert_allclose(ours.d[t], d, rtol=1e-4, atol=1e-6)
@@ -53,7 +53,7 @@ def test_the_loops_gradient_is_that_of_plain_differentiation():
         return sum(jnp.sum(leaf * jax.random.normal(jax.random.key(i), leaf.shape)) for i, leaf in enumerate(leaves))
 
     gradients = [
-        jax.jit(jax.grad(lambda *args, f=f: probe(f, *args), (0, 1, 2)))(lstm.by_d, start, given)
+        jax.jit(jax.grad(lambda *args, f=f: probe(f, *args), (0, 1, 2)))(lstm.w_d, start, given)
         for f in (_lstm_loop, _lstm_scan)
     ]
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), *gradients)
@@ -61,11 +61,11 @@ def test_the_loops_gradient_is_that_of_plain_differentiation():
 
 def test_acting_forms_the_belief_that_replay_forms(state):
     window = windows(jax.random.key(1), 1, TIME, jnp.zeros((1, TIME), bool).at[0, jnp.array([0, 5])].set(True))
-    step = time_major(window, 0, None).step
+    step = window.step
     at_once = jax.jit(lambda: state.lstm.unroll(state.lstm.start(1), AGENT.perception(step), step.is_first))()
     memory, act = AGENT.reset(SPEC), jax.jit(AGENT.act)
     for t in range(TIME):
-        moment = jax.tree.map(lambda leaf, t=t: leaf[0, t], window.step)
+        moment = jax.tree.map(lambda leaf, t=t: leaf[t, 0], window.step)
         _, memory = act(state, memory, moment, jax.random.key(t), jnp.array(False))
         np.testing.assert_allclose(memory.d, at_once.d[t, 0], rtol=1e-5, atol=1e-6)
 
@@ -78,13 +78,13 @@ def batch_of(agent, lstm, window):
 def test_batches_are_aligned_in_time(state):
     window = windows(jax.random.key(1), 2, TIME)
     batch = jax.jit(lambda: batch_of(AGENT, state.lstm, window))()
-    step = time_major(window, 0, None).step
+    step = window.step
     d = jax.jit(lambda: state.lstm.unroll(state.lstm.start(2), AGENT.perception(step), step.is_first).d)()
     for t, sequence in ((0, 0), (2, 1), (5, 1)):
         row, now = 2 * t + sequence, AGENT.burn_in + t
         np.testing.assert_allclose(batch.belief[row], d[now, sequence], rtol=1e-5, atol=1e-6)
         np.testing.assert_allclose(batch.next_belief[row], d[now + 1, sequence], rtol=1e-5, atol=1e-6)
-        np.testing.assert_array_equal(batch.seen[row], batch.belief[row])
+        np.testing.assert_array_equal(batch.actor_input[row], batch.belief[row])
         np.testing.assert_array_equal(batch.action[row], step.prev_action[now + 1, sequence])
         assert batch.reward[row] == step.reward[now + 1, sequence]
 
@@ -99,15 +99,15 @@ def frozen_losses(agent, state, window, key):
     ends = fixed._replace(reward=fixed.reward + agent.gamma * beyond, terminated=jnp.ones_like(fixed.terminated))
 
     def j_pi(lstm):
-        seen = batch_of(agent, lstm, window).belief
-        return actor_loss(controller.actor, controller, fixed._replace(seen=seen), noise, 1e-3)[0]
+        actor_input = batch_of(agent, lstm, window).belief
+        return actor_loss(controller.actor, controller, fixed._replace(actor_input=actor_input), noise, 1e-3)[0]
 
     def j_v(lstm):
         return value_loss(controller.value, batch_of(agent, lstm, window).belief, v_target, fixed.valid)
 
     def j_q(lstm):
         belief = batch_of(agent, lstm, window).belief
-        return q_loss(controller.critics, controller.target_value, ends._replace(belief=belief), agent.gamma)
+        return q_loss(controller.critics, controller.target_value, ends._replace(belief=belief))
 
     return j_pi, j_v, j_q
 
@@ -118,11 +118,11 @@ def test_gradients_of_three_losses_reach_the_lstm_and_none_through_targets(state
     window, key = windows(jax.random.key(1), 2, TIME), jax.random.key(2)
     direction = random_like(state.lstm, jax.random.key(3))
     functions = [jax.jit(function) for function in frozen_losses(agent, state, window, key)]
-    by_pi, by_v, by_q = (slope(function, state.lstm, direction, by=2e-3) for function in functions)
-    by_critics, by_actor, _ = jax.jit(agent.gradients)(state.lstm, state.lstm, state.controller, window, key)[0]
-    assert min(abs(by_pi), abs(by_v), abs(by_q)) > 1e-3
-    assert along(by_critics, direction) == pytest.approx(by_v + by_q, rel=0.02)
-    assert along(by_actor, direction) == pytest.approx(by_pi, rel=0.02)
+    grad_pi, grad_v, grad_q = (slope(function, state.lstm, direction, by=2e-3) for function in functions)
+    grad_critics, grad_actor, _ = jax.jit(agent.gradients)(state.lstm, state.lstm, state.controller, window, key)[0]
+    assert min(abs(grad_pi), abs(grad_v), abs(grad_q)) > 1e-3
+    assert along(grad_critics, direction) == pytest.approx(grad_v + grad_q, rel=0.02)
+    assert along(grad_actor, direction) == pytest.approx(grad_pi, rel=0.02)
 
 
 def test_the_target_lstm_is_what_the_target_value_reads(state):
@@ -133,21 +133,21 @@ def test_the_target_lstm_is_what_the_target_value_reads(state):
     np.testing.assert_array_equal(batch.belief, batch_of(AGENT, state.lstm, window).belief)
     np.testing.assert_array_equal(batch.next_belief, batch_of(AGENT, other, window).next_belief)
     gradients = jax.jit(AGENT.gradients)
-    (by_critics, by_actor, _), _ = gradients(state.lstm, state.lstm, state.controller, window, key)
-    (by_critics_now, by_actor_now, _), _ = gradients(state.lstm, other, state.controller, window, key)
-    assert differ(by_critics, by_critics_now)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-8), by_actor, by_actor_now)
+    (grad_critics, grad_actor, _), _ = gradients(state.lstm, state.lstm, state.controller, window, key)
+    (grad_critics_now, grad_actor_now, _), _ = gradients(state.lstm, other, state.controller, window, key)
+    assert differ(grad_critics, grad_critics_now)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-8), grad_actor, grad_actor_now)
 
 
 def test_no_gradient_goes_into_the_burn_in(state):
     """The weights by which the burn-in alone perceives the first input do not learn."""
     window, key = windows(jax.random.key(1), 2, TIME), jax.random.key(2)
-    obs = window.step.obs.at[:, AGENT.burn_in :, 0].set(0.0)
+    obs = window.step.obs.at[AGENT.burn_in :, :, 0].set(0.0)
     window = window._replace(step=window.step._replace(obs=obs))
-    by_critics, by_actor, _ = jax.jit(AGENT.gradients)(state.lstm, state.lstm, state.controller, window, key)[0]
-    for gradient in (by_critics, by_actor):
-        np.testing.assert_array_equal(gradient.by_x[0], 0.0)
-        assert np.all(gradient.by_x[1] != 0.0)
+    grad_critics, grad_actor, _ = jax.jit(AGENT.gradients)(state.lstm, state.lstm, state.controller, window, key)[0]
+    for gradient in (grad_critics, grad_actor):
+        np.testing.assert_array_equal(gradient.w_x[0], 0.0)
+        assert np.all(gradient.w_x[1] != 0.0)
 
 
 def test_an_update_trains_everything_and_the_targets_follow_slowly(state):
@@ -169,7 +169,7 @@ def test_it_perceives_what_it_is_told_to():
     for more, size in (({}, 3), ({"perceive_action": True}, 5), ({"perceive_reward": True}, 4)):
         agent = dataclasses.replace(AGENT, **more)
         state = jax.eval_shape(lambda key, agent=agent: agent.init(key, SPEC), jax.random.key(0))
-        assert state.lstm.by_x.shape[0] == size
+        assert state.lstm.w_x.shape[0] == size
 
 
 @pytest.mark.parametrize("wrong", [{"seq_len": 0}, {"burn_in": -1}, {"lr_lstm": 2.0}, {"pretrain_updates": -1}])

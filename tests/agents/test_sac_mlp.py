@@ -12,7 +12,7 @@ from agents.moments import SPEC, differ, windows
 from beliefrl.agents.sac_mlp import SACMLPAgent
 from beliefrl.types import Timestep, UserError, Window
 
-GOLDEN = pathlib.Path(__file__).parents[1] / "golden" / "sac.npz"
+GOLDEN = pathlib.Path(__file__).parents[1] / "models" / "golden" / "sac.npz"
 AGENT = SACMLPAgent(policy_layers=(8, 8), value_layers=(8, 8), batch_size=6)
 STANDARDISED = dataclasses.replace(AGENT, standardise=True)
 
@@ -34,7 +34,7 @@ def test_its_transitions_are_those_of_the_golden_update():
         is_first=jnp.zeros((rows, 2), bool).at[:, 0].set(True),
         terminated=jnp.stack([jnp.zeros(rows, bool), numbers["terminated"] > 0], axis=1),
     )
-    batch = AGENT.batch(Window(step, (), jnp.ones((rows, 2), bool)))
+    batch = AGENT.batch(jax.tree.map(lambda leaf: leaf.swapaxes(0, 1), Window(step, (), jnp.ones((rows, 2), bool))))
     for name in ("belief", "next_belief", "action", "reward", "terminated"):
         np.testing.assert_array_equal(getattr(batch, name), numbers[name])
     assert batch.valid.all()
@@ -44,10 +44,10 @@ def test_pairs_across_episodes_enter_no_loss(state):
     is_first = jnp.zeros((6, 2), bool).at[:, 0].set(True).at[2, 1].set(True)
     update = jax.jit(AGENT.pretrain)
     one = windows(jax.random.key(1), 6, 2, is_first)
-    other = jax.tree.map(lambda leaf: leaf.at[2].set(leaf[3]) if leaf.dtype != bool else leaf, one)
+    other = jax.tree.map(lambda leaf: leaf.at[:, 2].set(leaf[:, 3]) if leaf.dtype != bool else leaf, one)
     results = [update(state, window, jax.random.key(2)) for window in (one, other)]
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7), *results)
-    assert not np.allclose(one.step.obs[2], other.step.obs[2])
+    assert not np.allclose(one.step.obs[:, 2], other.step.obs[:, 2])
 
 
 @pytest.mark.parametrize("agent", [AGENT, STANDARDISED])
@@ -68,7 +68,7 @@ def test_standardised_it_does_not_matter_in_which_units_observations_are():
     actions, learn = [], jax.jit(STANDARDISED.pretrain)
     for each in (window, others):
         after, _ = learn(state, each, jax.random.key(2))
-        step = jax.tree.map(lambda leaf: leaf[3, 1], each.step)
+        step = jax.tree.map(lambda leaf: leaf[1, 3], each.step)
         actions.append(STANDARDISED.act(after, (), step, jax.random.key(3), jnp.array(False))[0])
     np.testing.assert_allclose(*actions, rtol=0.01)  # but for what keeps quiet entries from infinity
     raw = AGENT.act(after._replace(scale=None), (), step, jax.random.key(3), jnp.array(False))[0]

@@ -8,7 +8,7 @@ import pytest
 from agents.moments import SPEC, along, changed_where_missing, differ, random_like, same, slope, windows
 from beliefrl.agents.slac import SLACAgent, begin_windows
 from beliefrl.models.latent_model import _loop, _scan, _zeros, elbo_terms
-from beliefrl.types import UserError, perception, time_major
+from beliefrl.types import UserError, perception
 
 AGENT = SLACAgent(
     policy_layers=(8,),
@@ -46,7 +46,7 @@ def log_prob(x, mean, sigma):
 def moments():
     """Six moments of two windows, with an episode that begins in the second."""
     is_first = jnp.zeros((2, 6), bool).at[:, 0].set(True).at[1, 3].set(True)
-    return begin_windows(time_major(windows(jax.random.key(1), 2, 6, is_first), 0, None))
+    return begin_windows(windows(jax.random.key(1), 2, 6, is_first))
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +128,7 @@ def test_the_gradient_of_the_elbo_agrees_with_finite_differences(state):
 
 def test_pretraining_trains_the_model_alone_and_an_update_the_controller_alone(state):
     window = windows(jax.random.key(1), 4, TIME)
-    after, _ = jax.jit(AGENT.pretrain)(state, jax.tree.map(lambda leaf: leaf[:2], window), jax.random.key(2))
+    after, _ = jax.jit(AGENT.pretrain)(state, jax.tree.map(lambda leaf: leaf[:, :2], window), jax.random.key(2))
     assert differ(after.model, state.model)
     assert same(after.controller, state.controller)
     _, batches, _ = jax.jit(AGENT.begin_cycle)(state, window, jax.random.key(2))
@@ -142,10 +142,10 @@ def test_the_actor_learns_on_what_it_read(state, begins):
     """Also where an episode is younger than the history: its first observation stands for those before it."""
     is_first = jnp.zeros((1, TIME), bool).at[0, jnp.array(begins)].set(True)
     window = windows(jax.random.key(1), 1, TIME, is_first)
-    learned = jax.jit(AGENT.histories)(time_major(window, 0, None).step)
+    learned = jax.jit(AGENT.histories)(window.step)
     memory, act = AGENT.reset(SPEC), jax.jit(AGENT.act)
     for t in range(TIME):
-        moment = jax.tree.map(lambda leaf, t=t: leaf[0, t], window.step)
+        moment = jax.tree.map(lambda leaf, t=t: leaf[t, 0], window.step)
         _, memory = act(state, memory, moment, jax.random.key(t), jnp.array(True))
         if t >= AGENT.history - 1:
             np.testing.assert_array_equal(learned[t - AGENT.history + 1, 0], memory.ravel())
@@ -154,11 +154,11 @@ def test_the_actor_learns_on_what_it_read(state, begins):
 def test_batches_are_aligned_in_time(state):
     window = windows(jax.random.key(1), 2, TIME)
     batch = jax.jit(AGENT.batches)(state.model, window, jax.random.key(2))
-    step = time_major(window, 0, None).step
-    assert batch.seen.shape == (1, 2 * AGENT.seq_len, AGENT.history * 4)
+    step = window.step
+    assert batch.actor_input.shape == (1, 2 * AGENT.seq_len, AGENT.history * 4)
     for t, sequence in ((0, 0), (1, 1), (3, 0)):
         row, now = 2 * t + sequence, AGENT.history - 1 + t
-        np.testing.assert_array_equal(batch.seen[0, row, -4:], perception(step)[now, sequence])
+        np.testing.assert_array_equal(batch.actor_input[0, row, -4:], perception(step)[now, sequence])
         np.testing.assert_array_equal(batch.action[0, row], step.prev_action[now + 1, sequence])
         assert batch.reward[0, row] == step.reward[now + 1, sequence]
         if t:

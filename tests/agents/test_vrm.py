@@ -11,9 +11,9 @@ import pytest
 from agents.moments import SMALL, SPEC, differ, same
 from beliefrl import agents
 from beliefrl.agents.vrm import VRMAgent
-from beliefrl.models.nets import draw, standardised, unscaled
-from beliefrl.models.variational_model import VRM, Gaussian, Loop, LSTMState, _loop, _scan
-from beliefrl.types import Timestep, UserError, Window, check_choice, time_major
+from beliefrl.models.nets import draw, initial_statistics, standardise
+from beliefrl.models.variational_model import VRM, Gaussian, LSTMState, VRMLoopWeights, _loop, _scan
+from beliefrl.types import Timestep, UserError, Window, check_choice
 
 AGENT = VRMAgent(**SMALL)
 
@@ -36,7 +36,8 @@ def windows(key, batch, is_first=None, exists=None):
         none,
     )
     note = (jax.random.normal(keys[3], (batch, time, AGENT.d_size)),)
-    return Window(step, note, ~none if exists is None else exists)
+    window = Window(step, note, ~none if exists is None else exists)
+    return jax.tree.map(lambda leaf: leaf.swapaxes(0, 1), window)
 
 
 def test_the_defaults_are_the_papers_tables():
@@ -110,17 +111,17 @@ def test_pretraining_trains_the_first_impression_model_alone(state):
 
 @jax.jit
 def infer(vrm, window, noise):
-    moments = time_major(window, 0, None)
+    moments = window
     x = jnp.concatenate([moments.step.obs, moments.step.reward[..., None]], axis=-1)
     return vrm.infer(vrm.start(noise.shape[1]), x, moments.step.prev_action, moments.step.is_first, noise)
 
 
 def test_an_episode_inside_a_window_begins_with_an_empty_memory(state):
     window = windows(jax.random.key(1), 1)
-    two = window._replace(step=window.step._replace(is_first=window.step.is_first.at[0, 5].set(True)))
+    two = window._replace(step=window.step._replace(is_first=window.step.is_first.at[5, 0].set(True)))
     noise = jax.random.normal(jax.random.key(2), (11, 1, AGENT.z_size))
     whole = infer(state.keep, two, noise)
-    second = infer(state.keep, jax.tree.map(lambda leaf: leaf[:, 5:], two), noise[5:])
+    second = infer(state.keep, jax.tree.map(lambda leaf: leaf[5:], two), noise[5:])
     np.testing.assert_allclose(whole.state.d[5:], second.state.d, rtol=1e-5, atol=1e-6)
     np.testing.assert_array_equal(whole.before[5], 0)
     assert not np.allclose(infer(state.keep, window, noise).state.d[5], whole.state.d[5])
@@ -129,7 +130,7 @@ def test_an_episode_inside_a_window_begins_with_an_empty_memory(state):
 def test_the_burn_in_and_the_sequence_are_one_unroll(state):
     window = windows(jax.random.key(1), 3)
     noise = jax.random.normal(jax.random.key(2), (11, 3, AGENT.z_size))
-    moments = time_major(window, 0, None)
+    moments = window
     x = jnp.concatenate([moments.step.obs, moments.step.reward[..., None]], axis=-1)
     whole = infer(state.keep, window, noise)
     start = jax.tree.map(lambda leaf: leaf[3], whole.state)
@@ -145,7 +146,7 @@ def test_acting_forms_the_belief_that_replay_forms(state):
     at_once = infer(state.keep, window, jnp.zeros((11, 1, AGENT.z_size)))
     memory, mode, act = AGENT.reset(SPEC), jnp.array(False), jax.jit(AGENT.act)
     for t in range(11):
-        step = jax.tree.map(lambda leaf, t=t: leaf[0, t], window.step)
+        step = jax.tree.map(lambda leaf, t=t: leaf[t, 0], window.step)
         _, memory = act(state, memory, step, jax.random.key(t), mode)
         np.testing.assert_allclose(memory.keep.d, at_once.state.d[t, 0], rtol=1e-5, atol=1e-6)
 
@@ -169,9 +170,9 @@ def test_batches_are_aligned_in_time(state):
     for update, t, sequence in ((0, 0, 0), (3, 2, 1), (4, 5, 1)):
         row, source, now = t * 2 + sequence, update * 2 + sequence, AGENT.burn_in + t
         picked = jax.tree.map(lambda leaf, update=update, row=row: leaf[update, row], batch)
-        step = jax.tree.map(lambda leaf, source=source: leaf[source], window.step)
-        np.testing.assert_array_equal(picked.belief[: AGENT.d_size], window.note[0][source, now])
-        np.testing.assert_array_equal(picked.next_belief[: AGENT.d_size], window.note[0][source, now + 1])
+        step = jax.tree.map(lambda leaf, source=source: leaf[:, source], window.step)
+        np.testing.assert_array_equal(picked.belief[: AGENT.d_size], window.note[0][now, source])
+        np.testing.assert_array_equal(picked.next_belief[: AGENT.d_size], window.note[0][now + 1, source])
         np.testing.assert_array_equal(picked.belief[-4:], [*step.obs[now], step.reward[now]])
         np.testing.assert_array_equal(picked.next_belief[-4:], [*step.obs[now + 1], step.reward[now + 1]])
         np.testing.assert_array_equal(picked.action, step.prev_action[now + 1])
@@ -183,6 +184,7 @@ def test_moments_that_do_not_exist_enter_no_loss(state):
     exists = jnp.ones((12, 11), bool).at[:, 8:].set(False)
     here = windows(jax.random.key(1), 12, exists=exists)
     other = windows(jax.random.key(9), 12, exists=exists)
+    exists = exists.T
     there = jax.tree.map(lambda a, b: jnp.where(exists.reshape(exists.shape + (1,) * (a.ndim - 2)), a, b), here, other)
     results = []
     for window in (here, there):
@@ -201,9 +203,9 @@ def test_a_recomputed_first_impression_is_the_stored_one_up_to_its_sample(state)
     recompute = dataclasses.replace(AGENT, store_first_impression=False)
     window = windows(jax.random.key(1), 10)
     key_first, _ = jax.random.split(jax.random.key(2))
-    moments = time_major(window, 0, None)
+    moments = window
     d_first = jax.jit(AGENT.unroll)(state.first, moments, AGENT.noise(key_first, moments)).d
-    stored = jax.jit(AGENT.batches)(state, window._replace(note=(d_first.swapaxes(0, 1),)), jax.random.key(2))
+    stored = jax.jit(AGENT.batches)(state, window._replace(note=(d_first,)), jax.random.key(2))
     again = jax.jit(recompute.batches)(state, window._replace(note=()), jax.random.key(2))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), stored, again)
 
@@ -216,7 +218,7 @@ def test_beliefs_of_means_are_without_noise_where_it_acts_and_where_it_learns(st
     assert differ(*sampled)
     memory, act = AGENT.reset(SPEC), jax.jit(agents[0].act)
     for t in range(AGENT.burn_in + 1):  # until the belief of the first transition
-        step = jax.tree.map(lambda leaf, t=t: leaf[0, t], window.step)
+        step = jax.tree.map(lambda leaf, t=t: leaf[t, 0], window.step)
         _, memory = act(state, memory, step, jax.random.key(t), jnp.array(True))
     belief = jnp.concatenate([memory.first.d, memory.keep.d])
     np.testing.assert_allclose(belief, mean[0][0, 0, : 2 * AGENT.d_size], rtol=1e-5, atol=1e-6)
@@ -225,16 +227,16 @@ def test_beliefs_of_means_are_without_noise_where_it_acts_and_where_it_learns(st
 
 def test_standardised_beliefs_are_what_the_controller_learns_from_and_acts_on(state):
     agent, window = dataclasses.replace(AGENT, standardise=True), windows(jax.random.key(1), 12)
-    fresh = state._replace(scale=unscaled(2 * AGENT.d_size + SPEC.obs_dim + 1))
+    fresh = state._replace(scale=initial_statistics(2 * AGENT.d_size + SPEC.obs_dim + 1))
     after, batches, _ = jax.jit(agent.begin_cycle)(fresh, window, jax.random.key(2))
     plain, others, _ = jax.jit(AGENT.begin_cycle)(state, window, jax.random.key(2))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7), after._replace(scale=None), plain)
-    np.testing.assert_allclose(batches.belief, standardised(after.scale, others.belief), rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(batches.next_belief, standardised(after.scale, others.next_belief), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(batches.belief, standardise(after.scale, others.belief), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(batches.next_belief, standardise(after.scale, others.next_belief), rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(jnp.mean(batches.belief, (0, 1)), 0, atol=1e-4)  # of the one batch that was seen
     step, mode = jax.tree.map(lambda leaf: leaf[0, 0], window.step), jnp.array(False)
     action, memory = jax.jit(agent.act)(after, agent.reset(SPEC), step, jax.random.key(3), mode)
-    belief = standardised(after.scale, jnp.concatenate([memory.first.d, memory.keep.d, step.obs, step.reward[None]]))
+    belief = standardise(after.scale, jnp.concatenate([memory.first.d, memory.keep.d, step.obs, step.reward[None]]))
     np.testing.assert_allclose(action, agent.choose(after.controller, belief, jax.random.key(3), mode), rtol=1e-5)
 
 
@@ -255,7 +257,7 @@ def test_decoding_from_the_prior_and_sums_are_other_losses(state):
 
 def test_the_loops_gradient_is_that_of_plain_differentiation():
     vrm = draw(jax.random.key(0), VRM(4, 2, 8, 4, 8))
-    weights = Loop(vrm.joint.by_d, vrm.joint.by_z, vrm.posterior_mean, vrm.posterior_sigma)
+    weights = VRMLoopWeights(vrm.joint.w_d, vrm.joint.w_z, vrm.posterior_mean, vrm.posterior_sigma)
     start = LSTMState(*jax.random.normal(jax.random.key(1), (2, 3, 8)))
     given = jax.random.normal(jax.random.key(2), (5, 3, 2 * 8 + 4 * 8))
     is_first = jnp.zeros((5, 3), bool).at[2, 1].set(True)

@@ -60,10 +60,10 @@ def vrm_from(numbers):
     others = ("features", "prior_mean", "prior_sigma", "decoder_mean", "decoder_sigma")
     return eqx.tree_at(
         lambda vrm: (
-            vrm.joint.by_d,
-            vrm.joint.by_features,
-            vrm.joint.by_action,
-            vrm.joint.by_z,
+            vrm.joint.w_d,
+            vrm.joint.w_features,
+            vrm.joint.w_action,
+            vrm.joint.w_z,
             vrm.joint.bias,
             vrm.posterior_mean,
             vrm.posterior_sigma,
@@ -152,10 +152,11 @@ def update(sac_numbers):
     batch = Batch(
         *(jnp.array(sac_numbers[name]) for name in ("belief", "next_belief", "action", "reward")),
         terminated=jnp.array(sac_numbers["terminated"] > 0),
+        discount=jnp.full(11, float(sac_numbers["gamma"])),
         valid=jnp.ones(11, bool),
     )
     return controller, jax.grad(loss, has_aux=True)(
-        controller, batch, jnp.array(sac_numbers["noise"]), gamma=float(sac_numbers["gamma"]), regulariser=1e-3
+        controller, batch, jnp.array(sac_numbers["noise"]), regulariser=1e-3
     )
 
 

@@ -5,15 +5,15 @@ import pytest
 
 from beliefrl.models.nets import (
     MLP,
-    Scale,
+    RunningStatistics,
     draw,
     gaussian_kl,
     gaussian_log_prob,
+    initial_statistics,
     lstm_state,
-    observe,
-    standardised,
+    standardise,
     tanh_gaussian,
-    unscaled,
+    update_statistics,
 )
 
 
@@ -86,22 +86,24 @@ def test_rest_continues_from_the_first_layer():
 def test_a_scale_has_the_moments_of_all_valid_vectors_and_makes_them_standard():
     x = 3.0 + jax.random.normal(jax.random.key(0), (4, 6, 5, 2)) * jnp.array([0.01, 2.0])[None, None, None]
     valid = jnp.ones((6, 5), bool).at[2, 1:].set(False)
-    known, blind = unscaled(2), unscaled(2)
+    known, blind = initial_statistics(2), initial_statistics(2)
     for batch in x:
-        known = observe(known, batch, valid)
-        blind = observe(blind, jnp.where(valid[..., None], batch, 1e6), valid)
+        known = update_statistics(known, batch, valid)
+        blind = update_statistics(blind, jnp.where(valid[..., None], batch, 1e6), valid)
     seen = np.asarray(x)[:, np.asarray(valid)].reshape(-1, 2)
     np.testing.assert_allclose(known.mean, seen.mean(0), rtol=1e-5)
     np.testing.assert_allclose(jnp.sqrt(known.variance), seen.std(0), rtol=0.05)  # batches have means of their own
     jax.tree.map(np.testing.assert_array_equal, known, blind)
-    made = np.asarray(standardised(known, jnp.asarray(seen)))
+    made = np.asarray(standardise(known, jnp.asarray(seen)))
     np.testing.assert_allclose(made.mean(0), 0, atol=1e-4)
     np.testing.assert_allclose(made.std(0), [0.91, 1.0], rtol=0.05)  # 0.01 / (0.01 + 0.001): the quiet stay quieter
 
 
 def test_a_scale_forgets_and_its_entries_are_bounded():
-    old = Scale(jnp.zeros(1), jnp.ones(1), jnp.array(1e6))
-    after = jax.lax.fori_loop(0, 5000, lambda _, scale: observe(scale, jnp.full((3, 1), 7.0), jnp.ones(3, bool)), old)
+    old = RunningStatistics(jnp.zeros(1), jnp.ones(1), jnp.array(1e6))
+    after = jax.lax.fori_loop(
+        0, 5000, lambda _, scale: update_statistics(scale, jnp.full((3, 1), 7.0), jnp.ones(3, bool)), old
+    )
     np.testing.assert_allclose(after.mean, 7.0, rtol=0.01)  # e^-5 of the old mean is left
-    np.testing.assert_array_equal(standardised(old, jnp.array([-1e9])), [-10.0])
-    assert float(standardised(None, jnp.array([1e9]))[0]) == 1e9
+    np.testing.assert_array_equal(standardise(old, jnp.array([-1e9])), [-10.0])
+    assert float(standardise(None, jnp.array([1e9]))[0]) == 1e9

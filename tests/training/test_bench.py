@@ -34,8 +34,8 @@ MEASURED = {
 
 
 def shapes(agent, spec):
-    """The state of an agent, without its numbers."""
-    return jax.eval_shape(lambda key: agent.init(key, spec), jax.random.key(0))
+    """The networks of an agent, without their numbers."""
+    return jax.eval_shape(lambda key: agent.networks(agent.init(key, spec)), jax.random.key(0))
 
 
 @pytest.mark.slow

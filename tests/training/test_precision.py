@@ -7,7 +7,7 @@ import jax
 import pytest
 
 from beliefrl import evaluate, load, play, resume, tasks, train
-from beliefrl.agents.sac import SAC
+from beliefrl.agents.base import SACAgent
 from beliefrl.agents.vrm import VRMAgent
 from beliefrl.training import phases
 from beliefrl.viewing.prediction import predictions
@@ -71,7 +71,7 @@ def test_what_is_made_of_a_run_has_its_precision(tmp_path, monkeypatch, precisio
 
         return call
 
-    monkeypatch.setattr(SAC, "choose", spied(SAC.choose))
+    monkeypatch.setattr(SACAgent, "choose", spied(SACAgent.choose))
     monkeypatch.setattr(VRMAgent, "predict", spied(VRMAgent.predict))
     for use in (
         lambda: evaluate(run, episodes=1),

@@ -43,8 +43,8 @@ def test_windows_are_the_newest_moments_in_order(firsts, capacity, shape):
     replay = filled(capacity, firsts)
     stored = np.arange(len(firsts))[-capacity:]
     window = sample(replay, jax.random.key(0), 8, shape)
-    numbers, exists = np.array(window.note[0]), np.array(window.exists)
-    for row, there, is_first in zip(numbers, exists, np.array(window.step.is_first), strict=True):
+    numbers, exists = np.array(window.note[0]).T, np.array(window.exists).T
+    for row, there, is_first in zip(numbers, exists, np.array(window.step.is_first).T, strict=True):
         seen = row[there].astype(int)
         assert len(seen) > 0
         np.testing.assert_array_equal(np.diff(seen), 1)
@@ -62,7 +62,7 @@ def test_exactly_the_transitions_within_episodes_can_be_drawn(firsts, capacity):
     expected = {n for n in stored[:-1] if not firsts[n + 1]}
     window = sample(replay, jax.random.key(1), 600, shape)
     valid = np.array(transitions(window, shape.burn_in))
-    now = np.array(window.note[0])[:, shape.burn_in : -1]
+    now = np.array(window.note[0])[shape.burn_in : -1]
     assert set(now[valid].astype(int)) == expected
 
 
@@ -76,55 +76,11 @@ def test_a_masked_addition_leaves_the_ring_alone():
 def test_starts_are_uniform():
     shape, count = WindowShape(2, 4), 30
     window = sample(filled(64, np.zeros(count, bool)), jax.random.key(2), 20_000, shape)
-    starts = np.array(window.note[0])[:, shape.burn_in].astype(int)
+    starts = np.array(window.note[0])[shape.burn_in].astype(int)
     drawn = np.bincount(starts, minlength=count)
     possible = count - shape.length
     assert set(np.flatnonzero(drawn)) == set(range(possible))
     assert np.abs(drawn[:possible] / drawn.sum() * possible - 1).max() < 0.2
-
-
-def episodes_of(firsts):
-    """The numbers of the first and the last moment of every episode."""
-    begins = np.flatnonzero(firsts)
-    return list(zip(begins, np.append(begins[1:], len(firsts)) - 1, strict=True))
-
-
-@settings(deadline=None, max_examples=15)
-@given(st.lists(st.booleans(), min_size=3, max_size=30), st.sampled_from([8, 64]))
-def test_windows_of_one_episode_end_with_it(firsts, capacity):
-    firsts[0] = True
-    shape, oldest = WindowShape(3, 5, one_episode=True), max(len(firsts) - capacity, 0)
-    window = sample(filled(capacity, firsts), jax.random.key(1), 600, shape)
-    numbers, exists = np.array(window.note[0]).astype(int), np.array(window.exists)
-    firsts_stored = [i == oldest or firsts[i] for i in range(len(firsts))]
-    firsts_stored[:oldest] = [False] * oldest
-    of_moment = np.cumsum(firsts_stored)
-    for row, there, is_first in zip(numbers, exists, np.array(window.step.is_first), strict=True):
-        assert len(set(of_moment[row[there]])) <= 1
-        np.testing.assert_array_equal(np.diff(row[there]), 1)
-        np.testing.assert_array_equal(is_first[there], [firsts_stored[n] for n in row[there]])
-    valid = np.array(transitions(window, shape.burn_in))
-    drawn = set(numbers[:, shape.burn_in : -1][valid])
-    assert drawn == {n for n in range(oldest, len(firsts) - 1) if not firsts_stored[n + 1]}
-
-
-def test_episodes_are_drawn_as_the_authors_draw_them():
-    """In proportion to T + 2 length - 2; starts from length - 1 before the first transition to the last but one."""
-    firsts = np.zeros(50, bool)
-    firsts[[0, 3, 20]] = True
-    shape = WindowShape(0, 4, one_episode=True)
-    window = sample(filled(64, firsts), jax.random.key(2), 40_000, shape)
-    numbers, exists = np.array(window.note[0]).astype(int), np.array(window.exists)
-    assert exists.any(axis=1).all()
-    start = np.where(exists, numbers - np.arange(5), 10**6).min(axis=1)  # of those that overhang it lies before
-    seen = np.where(exists, numbers, -1).max(axis=1)
-    for begin, end in episodes_of(firsts):
-        within, length = (seen >= begin) & (seen <= end), end - begin
-        total = sum(end - begin + 6 for begin, end in episodes_of(firsts))
-        np.testing.assert_allclose(within.mean(), (length + 6) / total, rtol=0.03)
-        starts = np.bincount(start[within] - begin + 3)
-        assert len(starts) == length - 1 + 3
-        np.testing.assert_allclose(starts / starts.sum(), 1 / len(starts), rtol=0.25)
 
 
 def test_history_and_annotate_address_the_first_moments():

@@ -52,6 +52,14 @@ class Agent(Protocol):
         """The state before training: networks and optimisers."""
         ...
 
+    def networks(self, state: Any) -> Any:
+        """The state without what only updates need: its optimisers' fields are replaced by ().
+
+        It is what `act` and `predict` are given outside of training, what is saved as the trained agent, and what is
+        counted as parameters. `state` may have leading axes.
+        """
+        ...
+
     def reset(self, spec: Spec) -> Any:
         """The empty memory of one actor."""
         ...
@@ -89,12 +97,12 @@ class Predictive(Protocol):
         ...
 
     def predict(
-        self, state: Any, model: str, step: Timestep, seen: Bool[Array, " time"], key: Key[Array, ""]
+        self, state: Any, model: str, step: Timestep, observed: Bool[Array, " time"], key: Key[Array, ""]
     ) -> Gaussian:
         """What one of its models predicts of x_t = (o_t, r_{t-1}) along an episode, leaves (time, x).
 
-        Open loop where x_t is `seen`: latent variables are inferred from it. Closed loop where it is not: they are
-        drawn from the generative model, and x_t must not be looked at. NaN is what a model does not predict.
+        Open loop where x_t is `observed`: latent variables are inferred from it. Closed loop elsewhere: they are drawn
+        from the generative model, and x_t must not be used. Entries that the model does not predict are NaN.
         """
         ...
 

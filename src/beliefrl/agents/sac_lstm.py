@@ -16,11 +16,10 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents.sac import SAC, Metrics, for_each_update, split_updates
+from beliefrl.agents.base import Metrics, SACAgent, for_each_update, split_updates
 from beliefrl.models.nets import LSTM, LSTMState, descend, draw
-from beliefrl.models.returns import transition_batch
 from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState, soft_update, update
-from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range, time_major, transitions
+from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range
 
 
 class State(NamedTuple):
@@ -34,7 +33,7 @@ class State(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class SACLSTMAgent(SAC):
+class SACLSTMAgent(SACAgent):
     """Soft actor-critic on an LSTM of the observations, trained end to end (Han, Doya, Tani 2020, Appendix A.2.2)."""
 
     seq_len: int = 64
@@ -88,6 +87,10 @@ class SACLSTMAgent(SAC):
         lstm_optimiser = self.lstm_optimiser.init(lstm)  # pyright: ignore[reportArgumentType]
         return State(lstm, lstm, controller, (lstm_optimiser, lstm_optimiser), controller_optimiser)
 
+    def networks(self, state: State) -> State:
+        """The state without its optimisers."""
+        return state._replace(lstm_optimisers=(), controller_optimiser=())
+
     # Acting
 
     def perception(self, step: Timestep) -> Float[Array, "*batch x"]:
@@ -124,7 +127,7 @@ class SACLSTMAgent(SAC):
 
     def beliefs(self, lstm: LSTM, windows: Window) -> Float[Array, "time batch d"]:
         """d_t from the end of the burn-in on; no gradient goes into the burn-in."""
-        before, after = time_major(windows, 0, self.burn_in), time_major(windows, self.burn_in, None)
+        before, after = windows.between(0, self.burn_in), windows.between(self.burn_in, None)
         start = lstm.start(self.batch_size)
         if self.burn_in:
             still = jax.lax.stop_gradient(lstm)
@@ -140,9 +143,7 @@ class SACLSTMAgent(SAC):
         d_target: Float[Array, "time batch d"],
     ) -> Batch:
         """The windows' transitions, with beliefs for the critics, for the actor (the same numbers) and for V̄."""
-        step = time_major(windows, self.burn_in, None).step
-        valid = transitions(windows, self.burn_in).T
-        batch = transition_batch(step, valid, d, d_target, self.n_step, self.gamma, d_actor)
+        batch = self.transitions(windows, d, d_target, d_actor)
         return jax.tree.map(lambda leaf: leaf[0], split_updates(batch, self.batch_size))
 
     def gradients(
@@ -155,18 +156,18 @@ class SACLSTMAgent(SAC):
 
         d_target = self.beliefs(target_lstm, windows)
         d, pullback = jax.vjp(lambda lstm: self.beliefs(lstm, windows), lstm)
-        (by_d, by_d_actor, by_controller), metrics = jax.grad(loss, (0, 1, 2), has_aux=True)(d, d, controller)
-        return (*pullback(by_d), *pullback(by_d_actor), by_controller), metrics
+        (grad_d, grad_d_actor, grad_controller), metrics = jax.grad(loss, (0, 1, 2), has_aux=True)(d, d, controller)
+        return (*pullback(grad_d), *pullback(grad_d_actor), grad_controller), metrics
 
     def update(self, state: State, batch: Window, key: Key[Array, ""]) -> tuple[State, Metrics]:
         """One update of the LSTM and the controller; the batch is windows."""
         gradients, metrics = self.gradients(state.lstm, state.target_lstm, state.controller, batch, key)
-        by_critics, by_actor, by_controller = gradients
+        grad_critics, grad_actor, grad_controller = gradients
         s_critics, s_actor = state.lstm_optimisers
-        lstm, s_critics = descend(self.lstm_optimiser, by_critics, s_critics, state.lstm)
-        lstm, s_actor = descend(self.lstm_optimiser, by_actor, s_actor, lstm)
+        lstm, s_critics = descend(self.lstm_optimiser, grad_critics, s_critics, state.lstm)
+        lstm, s_actor = descend(self.lstm_optimiser, grad_actor, s_actor, lstm)
         controller, controller_optimiser = update(
-            self.optimisers, state.controller_optimiser, state.controller, by_controller, self.tau
+            self.optimisers, state.controller_optimiser, state.controller, grad_controller, self.tau
         )
         target_lstm = soft_update(state.target_lstm, lstm, self.tau)
         return State(lstm, target_lstm, controller, (s_critics, s_actor), controller_optimiser), metrics

@@ -1,7 +1,7 @@
 """SAC-MLP: a soft actor-critic on the observation alone, without memory (Haarnoja et al. 2018, 2019).
 
-Source: Section 5, Table 1, Appendix A.2.1. The belief is o_t. What the whole state does not tell, this agent cannot
-know: it is the measure of how much a task hides.
+Source: Section 5, Table 1, Appendix A.2.1. The belief is o_t. This agent has no memory, so its returns show
+how much a task hides.
 """
 
 import dataclasses
@@ -10,11 +10,10 @@ from typing import NamedTuple
 import jax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents.sac import SAC, Metrics, for_each_update, standardise_beliefs
-from beliefrl.models.nets import Scale, standardised, unscaled
-from beliefrl.models.returns import transition_batch
+from beliefrl.agents.base import Metrics, SACAgent, split_updates, standardise_beliefs
+from beliefrl.models.nets import RunningStatistics, initial_statistics, standardise
 from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState
-from beliefrl.types import Spec, Timestep, Window, WindowShape, check_range, time_major, transitions
+from beliefrl.types import Spec, Timestep, Window, WindowShape, check_range
 
 
 class State(NamedTuple):
@@ -22,11 +21,11 @@ class State(NamedTuple):
 
     controller: Controller
     controller_optimiser: OptimiserState
-    scale: Scale | None  # of observations, where they are standardised
+    scale: RunningStatistics | None  # of observations, where they are standardised
 
 
 @dataclasses.dataclass(frozen=True)
-class SACMLPAgent(SAC):
+class SACMLPAgent(SACAgent):
     """Soft actor-critic on the observation alone, without memory (Haarnoja et al. 2018)."""
 
     batch_size: int = 256
@@ -34,7 +33,7 @@ class SACMLPAgent(SAC):
     pretrain_updates: int = 5000
     """Updates of the controller at step_start_rl, as many as VRM's pre-training has (Section 5; 0 is off)."""
     standardise: bool = False
-    """Give the controller observations of mean 0 and deviation 1, by running moments, so that none is too quiet."""
+    """Standardise the controller's observations to mean 0 and deviation 1, by running statistics."""
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
@@ -44,7 +43,7 @@ class SACMLPAgent(SAC):
 
     @property
     def window(self) -> WindowShape:
-        """One transition and what follows it; where an episode ends between its two moments, it counts nowhere."""
+        """One transition and what follows it; it is masked where an episode ends between its two moments."""
         return WindowShape(burn_in=0, length=self.n_step)
 
     @property
@@ -56,8 +55,12 @@ class SACMLPAgent(SAC):
         return self.batch_size * self.cycle_updates
 
     def init(self, key: Key[Array, ""], spec: Spec) -> State:
-        scale = unscaled(spec.obs_dim) if self.standardise else None
+        scale = initial_statistics(spec.obs_dim) if self.standardise else None
         return State(*self.init_controller(key, spec.obs_dim, spec.action_dim), scale)
+
+    def networks(self, state: State) -> State:
+        """The state without its optimisers."""
+        return state._replace(controller_optimiser=())
 
     def reset(self, spec: Spec) -> tuple[()]:
         return ()
@@ -65,7 +68,7 @@ class SACMLPAgent(SAC):
     def act(
         self, state: State, memory: tuple[()], step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]
     ) -> tuple[Float[Array, " action"], tuple[()]]:
-        return self.choose(state.controller, standardised(state.scale, step.obs), key, explore), memory
+        return self.choose(state.controller, standardise(state.scale, step.obs), key, explore), memory
 
     def note(self, memory: tuple[()]) -> tuple[()]:
         return ()
@@ -77,13 +80,15 @@ class SACMLPAgent(SAC):
     def begin_cycle(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Batch, Metrics]:
         """The batch of each update."""
         scale, batch = standardise_beliefs(state.scale, self.batch(windows))
-        return state._replace(scale=scale), for_each_update(batch, self.batch_size), {}
+        return (
+            state._replace(scale=scale),
+            split_updates(jax.tree.map(lambda leaf: leaf[None], batch), self.batch_size),
+            {},
+        )
 
     def batch(self, windows: Window) -> Batch:
         """The windows' first transitions."""
-        step, valid = time_major(windows, 0, None).step, transitions(windows, 0).T
-        batch = transition_batch(step, valid, step.obs, step.obs, self.n_step, self.gamma)
-        return jax.tree.map(lambda leaf: leaf[0], batch)
+        return jax.tree.map(lambda leaf: leaf[0], self.transitions(windows, windows.step.obs))
 
     def update(self, state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
         controller, optimiser, metrics = self.learn_controller(state.controller, state.controller_optimiser, batch, key)

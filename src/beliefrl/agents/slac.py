@@ -18,10 +18,9 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents.sac import SAC, Metrics, split_updates
+from beliefrl.agents.base import Metrics, SACAgent, split_updates
 from beliefrl.models.latent_model import LatentModel, Latents, elbo_terms, predict
 from beliefrl.models.nets import Gaussian, descend, draw
-from beliefrl.models.returns import transition_batch
 from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean
 from beliefrl.types import (
     WIDEST,
@@ -33,8 +32,6 @@ from beliefrl.types import (
     check_choice,
     check_range,
     perception,
-    time_major,
-    transitions,
 )
 
 
@@ -48,7 +45,7 @@ class State(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class SLACAgent(SAC):
+class SLACAgent(SACAgent):
     """Critics on the latent state of a learned model, an actor on the last eight observations (Lee et al. 2019)."""
 
     seq_len: int = 8
@@ -113,10 +110,16 @@ class SLACAgent(SAC):
         key_model, key_controller = jax.random.split(key)
         sizes = (spec.obs_dim, spec.action_dim, self.z1_size, self.z2_size)
         model = draw(key_model, LatentModel(*sizes, self.model_layers))
-        seen = self.history * (spec.obs_dim + 1)
-        controller, controller_optimiser = self.init_controller(key_controller, self.z2_size, spec.action_dim, seen)
+        actor_size = self.history * (spec.obs_dim + 1)
+        controller, controller_optimiser = self.init_controller(
+            key_controller, self.z2_size, spec.action_dim, actor_size
+        )
         model_optimiser = self.model_optimiser.init(model)  # pyright: ignore[reportArgumentType]
         return State(model, controller, model_optimiser, controller_optimiser)
+
+    def networks(self, state: State) -> State:
+        """The state without its optimisers."""
+        return state._replace(model_optimiser=(), controller_optimiser=())
 
     # Acting
 
@@ -145,12 +148,12 @@ class SLACAgent(SAC):
         return ("latent",)
 
     def predict(
-        self, state: State, model: str, step: Timestep, seen: Bool[Array, " time"], key: Key[Array, ""]
+        self, state: State, model: str, step: Timestep, observed: Bool[Array, " time"], key: Key[Array, ""]
     ) -> Gaussian:
         key1, key2 = jax.random.split(key)
-        time = len(seen)
+        time = len(observed)
         noise = jax.random.normal(key1, (time, self.z1_size)), jax.random.normal(key2, (time, self.z2_size))
-        return predict(state.model, perception(step), step.prev_action, seen, noise)
+        return predict(state.model, perception(step), step.prev_action, observed, noise)
 
     # Learning the model
 
@@ -161,7 +164,7 @@ class SLACAgent(SAC):
 
     def model_loss(self, model: LatentModel, windows: Window, key: Key[Array, ""]) -> tuple[Float[Array, ""], Metrics]:
         """The negative ELBO, mean over the valid moments of the sequences."""
-        moments = begin_windows(time_major(windows, self.history - 1, -1))
+        moments = begin_windows(windows.between(self.history - 1, -1))
         step = moments.step
         latents = self.infer(model, moments, key)
         terms = elbo_terms(model, latents, step.obs, step.reward, step.prev_action, step.is_first)
@@ -183,30 +186,28 @@ class SLACAgent(SAC):
 
     def begin_cycle(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Batch, Metrics]:
         key_model, key_belief = jax.random.split(key)
-        for_model = jax.tree.map(lambda leaf: leaf[: self.batch_size], windows)
-        for_controller = jax.tree.map(lambda leaf: leaf[self.batch_size :], windows)
+        for_model = jax.tree.map(lambda leaf: leaf[:, : self.batch_size], windows)
+        for_controller = jax.tree.map(lambda leaf: leaf[:, self.batch_size :], windows)
         batches = self.batches(state.model, for_controller, key_belief)
         state, metrics = self.pretrain(state, for_model, key_model)
         return state, batches, metrics
 
     def batches(self, model: LatentModel, windows: Window, key: Key[Array, ""]) -> Batch:
         """The windows' transitions with their beliefs, split for a cycle's updates: leaves (update, batch, ...)."""
-        step, burn_in, context = time_major(windows, 0, None).step, self.window.burn_in, self.history // 2
-        inferred = begin_windows(time_major(windows, burn_in - context, None))
+        burn_in, context = self.window.burn_in, self.history // 2
+        inferred = begin_windows(windows.between(burn_in - context, None))
         belief = self.infer(model, inferred, key).z2[context:]
-        seen, valid = self.histories(step), transitions(windows, burn_in).T
-        after = time_major(windows, burn_in, None).step
-        batch = transition_batch(after, valid, belief, belief, self.n_step, self.gamma, seen)
+        batch = self.transitions(windows, belief, actor_input=self.histories(windows.step))
         return split_updates(batch, self.batch_size)
 
-    def histories(self, step: Timestep) -> Float[Array, "length batch seen"]:
-        """What the actor read at each moment after the burn-in of windows (time-major)."""
+    def histories(self, step: Timestep) -> Float[Array, "length batch actor_input"]:
+        """The actor's input at each moment after the burn-in of windows (time-major)."""
         x, time = perception(step), jnp.arange(step.reward.shape[0])
         begun = jax.lax.cummax(jnp.where(step.is_first, time[:, None], 0))  # when the moment's episode began
         back = time[self.history - 1 :, None] - jnp.arange(self.history)[::-1][None]
         index = jnp.maximum(back[:, :, None], begun[self.history - 1 :, None])  # (length, history, batch)
-        seen = x[index, jnp.arange(x.shape[1])].swapaxes(1, 2)
-        return seen.reshape(*seen.shape[:2], -1)
+        actor_input = x[index, jnp.arange(x.shape[1])].swapaxes(1, 2)
+        return actor_input.reshape(*actor_input.shape[:2], -1)
 
     def update(self, state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
         controller, optimiser, metrics = self.learn_controller(state.controller, state.controller_optimiser, batch, key)

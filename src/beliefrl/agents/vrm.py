@@ -2,7 +2,7 @@
 
 Source: Section 4, Algorithm 1, Tables 1 and 2, Appendix A.1; the ablations: Appendix C. The belief is
 s_t = [d_t of the first-impression model, d_t of the keep-learning model, x_t] with x_t = (o_t, r_{t-1}). The first
-model is pre-trained once and then never changes; the second learns all the time; the controller learns on the belief
+model is pre-trained once and then never changes; the second learns throughout; the controller learns on the belief
 and sends no gradient back. In an ablation the belief has the d_t of one model, or both models are deterministic.
 
 Departures:
@@ -21,9 +21,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents.sac import SAC, Metrics, split_updates, standardise_beliefs
-from beliefrl.models.nets import Gaussian, LSTMState, Scale, descend, draw, standardised, unscaled
-from beliefrl.models.returns import transition_batch
+from beliefrl.agents.base import Metrics, SACAgent, split_updates, standardise_beliefs
+from beliefrl.models.nets import Gaussian, LSTMState, RunningStatistics, descend, draw, initial_statistics, standardise
 from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean
 from beliefrl.models.variational_model import VRM, elbo_terms, predict, prediction_error
 from beliefrl.types import (
@@ -36,13 +35,11 @@ from beliefrl.types import (
     check_choice,
     check_range,
     perception,
-    time_major,
-    transitions,
 )
 
 
 class Memory(NamedTuple):
-    """What an actor remembers of its episode."""
+    """The recurrent states of an actor."""
 
     first: LSTMState | None
     keep: LSTMState | None
@@ -57,11 +54,11 @@ class State(NamedTuple):
     first_optimiser: optax.OptState
     keep_optimiser: optax.OptState
     controller_optimiser: OptimiserState
-    scale: Scale | None  # of beliefs, where they are standardised
+    scale: RunningStatistics | None  # of beliefs, where they are standardised
 
 
 @dataclasses.dataclass(frozen=True)
-class VRMAgent(SAC):
+class VRMAgent(SACAgent):
     """Two variational recurrent models form a belief, a soft actor-critic acts on it (Han, Doya, Tani 2020)."""
 
     # Table 2: of this agent
@@ -98,15 +95,12 @@ class VRMAgent(SAC):
     """Mean (the authors' code; lr_model was tuned on it) or sum (the formula) over the dimensions of z and x."""
     decode_from: Literal["posterior", "prior"] = "posterior"
     """What z is drawn from to decode x in training: the posterior (a true ELBO) or the prior (the authors' code)."""
-    windows: Literal["stream", "episode"] = "stream"
-    """Sequences drawn from the stream of all moments, in which episodes follow each other; or from one episode each,
-    which they overhang at both ends (the authors' code)."""
     store_first_impression: bool = True
     """Keep the first-impression model's d in the replay instead of computing it again for every update."""
     sample_belief: bool = True
-    """Form beliefs with a sample of z, as the models learn; if not, with the posterior's mean: they have no noise."""
+    """Form beliefs with a sample of z, as in training the models; if False, with the posterior's mean."""
     standardise: bool = False
-    """Give the controller beliefs of mean 0 and deviation 1, by running moments: quiet entries are heard as well."""
+    """Standardise the controller's beliefs to mean 0 and deviation 1, by running statistics."""
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
@@ -118,7 +112,6 @@ class VRMAgent(SAC):
         check_choice(self, "models", ("both", "single", "first", "keep"))
         check_choice(self, "elbo_scaling", ("mean", "sum"))
         check_choice(self, "decode_from", ("posterior", "prior"))
-        check_choice(self, "windows", ("stream", "episode"))
         if self.train_interval_klvrm % self.train_interval_rl:
             raise UserError(
                 f"train_interval_klvrm={self.train_interval_klvrm} is not a multiple of "
@@ -129,12 +122,12 @@ class VRMAgent(SAC):
 
     @property
     def has_first(self) -> bool:
-        """Whether there is a model that stands still once it is pre-trained."""
+        """Whether there is a first-impression model, which does not change after its pre-training."""
         return self.models in ("both", "first")
 
     @property
     def has_keep(self) -> bool:
-        """Whether there is a model that learns all the time."""
+        """Whether there is a keep-learning model, which is trained throughout."""
         return self.models != "first"
 
     @property
@@ -147,7 +140,7 @@ class VRMAgent(SAC):
 
     @property
     def window(self) -> WindowShape:
-        return WindowShape(self.burn_in, self.seq_len, self.windows == "episode")
+        return WindowShape(self.burn_in, self.seq_len)
 
     @property
     def pretrain_windows(self) -> int:
@@ -171,8 +164,12 @@ class VRMAgent(SAC):
         controller, controller_optimiser = self.init_controller(key_controller, belief, spec.action_dim)
         models: Any = first, keep
         of_first, of_keep = map(self.model_optimiser.init, models)
-        scale = unscaled(belief) if self.standardise else None
+        scale = initial_statistics(belief) if self.standardise else None
         return State(first, keep, controller, of_first, of_keep, controller_optimiser, scale)
+
+    def networks(self, state: State) -> State:
+        """The state without its optimisers."""
+        return state._replace(first_optimiser=(), keep_optimiser=(), controller_optimiser=())
 
     # Acting (Figure 2b)
 
@@ -201,7 +198,7 @@ class VRMAgent(SAC):
             self.perceive(state.keep, memory.keep, step, key_keep, explore),
         )
         belief = jnp.concatenate([*(part.d for part in memory if part is not None), perception(step)])
-        return self.choose(state.controller, standardised(state.scale, belief), key_action, explore), memory
+        return self.choose(state.controller, standardise(state.scale, belief), key_action, explore), memory
 
     def note(self, memory: Memory) -> tuple[Float[Array, " d"], ...]:
         """d_t of the first-impression model, or nothing."""
@@ -214,11 +211,11 @@ class VRMAgent(SAC):
         return ("keep",) * self.has_keep + ("first",) * self.has_first
 
     def predict(
-        self, state: State, model: str, step: Timestep, seen: Bool[Array, " time"], key: Key[Array, ""]
+        self, state: State, model: str, step: Timestep, observed: Bool[Array, " time"], key: Key[Array, ""]
     ) -> Gaussian:
         x, keys = perception(step), jax.random.split(key)
         noise = jax.random.normal(keys[0], (len(x), self.z_size)), jax.random.normal(keys[1], x.shape)
-        return predict(getattr(state, model), x, step.prev_action, seen, noise)
+        return predict(getattr(state, model), x, step.prev_action, observed, noise)
 
     # Learning the models (Figure 2c)
 
@@ -238,14 +235,14 @@ class VRMAgent(SAC):
     def learn_model(
         self, vrm: VRM, optimiser: optax.OptState, windows: Window, key: Key[Array, ""]
     ) -> tuple[VRM, optax.OptState, Metrics]:
-        """One step up the ELBO of the windows' last `seq_len` moments but one."""
+        """One Adam step on the negative ELBO of `seq_len` moments after the burn-in."""
         grads, metrics = jax.grad(self.model_loss, has_aux=True)(vrm, windows, key)
         return *descend(self.model_optimiser, grads, optimiser, vrm), metrics
 
     def model_loss(self, vrm: VRM, windows: Window, key: Key[Array, ""]) -> tuple[Float[Array, ""], Metrics]:
         """The negative ELBO (the squared error of deterministic models), mean over the valid moments after burn-in."""
         key_burn_in, key_infer, key_prior = jax.random.split(key, 3)
-        before, after = time_major(windows, 0, self.burn_in), time_major(windows, self.burn_in, -1)
+        before, after = windows.between(0, self.burn_in), windows.between(self.burn_in, -1)
         start = vrm.start(self.batch_size)
         if self.burn_in:
             noise = self.noise(key_burn_in, before)
@@ -277,25 +274,23 @@ class VRMAgent(SAC):
     def begin_cycle(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Batch, Metrics]:
         key_model, key_belief = jax.random.split(key)
         count = self.batch_size * self.has_keep
-        for_model = jax.tree.map(lambda leaf: leaf[:count], windows)
-        for_controller = jax.tree.map(lambda leaf: leaf[count:], windows)
+        for_model = jax.tree.map(lambda leaf: leaf[:, :count], windows)
+        for_controller = jax.tree.map(lambda leaf: leaf[:, count:], windows)
         state, metrics = self.learn_keep(state, for_model, key_model)
         scale, batches = standardise_beliefs(state.scale, self.batches(state, for_controller, key_belief))
         return state._replace(scale=scale), batches, metrics
 
     def batches(self, state: State, windows: Window, key: Key[Array, ""]) -> Batch:
         """The windows' transitions with their beliefs, split for a cycle's updates: leaves (update, batch, ...)."""
-        moments = time_major(windows, 0, None)
-        of_first, of_keep = (self.noise(k, moments, self.sample_belief) for k in jax.random.split(key))
-        parts = [perception(moments.step)]
+        of_first, of_keep = (self.noise(k, windows, self.sample_belief) for k in jax.random.split(key))
+        parts = [perception(windows.step)]
         if state.keep is not None:
-            parts.insert(0, self.unroll(state.keep, moments, of_keep).d)
+            parts.insert(0, self.unroll(state.keep, windows, of_keep).d)
         if state.first is not None:
             stored = self.store_first_impression
-            parts.insert(0, moments.note[0] if stored else self.unroll(state.first, moments, of_first).d)
-        belief, step = jnp.concatenate(parts, axis=-1)[self.burn_in :], time_major(windows, self.burn_in, None).step
-        valid = transitions(windows, self.burn_in).T
-        return split_updates(transition_batch(step, valid, belief, belief, self.n_step, self.gamma), self.batch_size)
+            parts.insert(0, windows.note[0] if stored else self.unroll(state.first, windows, of_first).d)
+        belief = jnp.concatenate(parts, axis=-1)[self.burn_in :]
+        return split_updates(self.transitions(windows, belief), self.batch_size)
 
     def update(self, state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
         controller, optimiser, metrics = self.learn_controller(state.controller, state.controller_optimiser, batch, key)

@@ -37,12 +37,11 @@ def wall_clock(run: Run) -> float | None:
 
 
 def parameters(run: Run) -> int | None:
-    """How many numbers the networks of one seed hold, optimisers apart."""
+    """How many numbers the saved agent of one seed holds (`Agent.networks`)."""
     path = run.folder / "agent.safetensors"
     if not path.exists():
         return None
-    saved = arrays.load(path)
-    return sum(values.size for name, values in saved.items() if "optimiser" not in name) // len(run.seeds)
+    return sum(values.size for values in arrays.load(path).values()) // len(run.seeds)
 
 
 def costs(groups: Sequence[Group]) -> list[Cost]:

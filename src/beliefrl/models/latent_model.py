@@ -1,4 +1,4 @@
-"""SLAC's latent variable model: two latent variables a moment, z¹ inferred from what is perceived, z² a memory of it.
+"""SLAC's latent variable model: two latent variables a moment, z¹ inferred from the perception, z² a memory of it.
 
 Source: Lee et al. 2019, Section 4; sizes and activations: Han, Doya, Tani 2020, Appendix A.2.3. With
 x_t = (o_t, r_{t-1}) and z_t = [z¹_t, z²_t]:
@@ -15,8 +15,8 @@ prior and decoders run after it, and the gradient of a weight inside the loop is
 
 Departures: perceptrons for convolutions, tanh, and a learned σ of the decoders, as Han et al. have it; μ and σ are two
 outputs of one perceptron, as Lee et al. have it (Han et al. have a perceptron for each, at twice the cost); and at an
-episode's first moment the same networks serve, told so by an input of their own, with zeros for what was before, where
-both have further networks.
+episode's first moment the same networks are used, with an input that marks it and zeros for z²_{t-1} and a_{t-1}, where
+both papers have further networks.
 """
 
 import itertools
@@ -110,11 +110,11 @@ class LatentModel(eqx.Module):
         """The latent variables of windows; they begin anew wherever is_first, where prev_action must be 0."""
         known = jnp.concatenate([is_first[..., None].astype(x.dtype), prev_action], axis=-1)
         z1, z2 = (part.shape[-1] for part in noise)
-        by_x, by_z2 = self.posterior.columns(x.shape[-1] + known.shape[-1], z2)
-        by_known, by_z1, next_by_z2 = self.next_z2.columns(known.shape[-1], z1, z2)
-        given1 = _add(jnp.concatenate([x, known], axis=-1) @ by_x, self.posterior.mlp.layers[0].bias)
-        given2 = _add(known @ by_known, self.next_z2.mlp.layers[0].bias)
-        weights = Loop(by_z2, by_z1, next_by_z2, self.posterior, self.next_z2)
+        w_x, w_z2 = self.posterior.columns(x.shape[-1] + known.shape[-1], z2)
+        w_known, w_z1, w_next_z2 = self.next_z2.columns(known.shape[-1], z1, z2)
+        given1 = _add(jnp.concatenate([x, known], axis=-1) @ w_x, self.posterior.mlp.layers[0].bias)
+        given2 = _add(known @ w_known, self.next_z2.mlp.layers[0].bias)
+        weights = LatentLoopWeights(w_z2, w_z1, w_next_z2, self.posterior, self.next_z2)
         return _loop(weights, (given1, given2), is_first, noise)
 
 
@@ -122,22 +122,22 @@ def predict(
     model: LatentModel,
     x: Float[Array, "time x"],
     prev_action: Float[Array, "time action"],
-    seen: Bool[Array, " time"],
+    observed: Bool[Array, " time"],
     noise: tuple[Float[Array, "time z1"], Float[Array, "time z2"]],
 ) -> Gaussian:
     """p(x_t | z_{t-1}, a_{t-1}, z_t) along one episode from its first moment on, leaves (time, x).
 
-    Where x_t is `seen`, z¹_t is drawn from the posterior: open loop. Where it is not, z¹_t is drawn from the prior:
+    Where x_t is `observed`, z¹_t is drawn from the posterior: open loop. Where it is not, z¹_t is drawn from the prior:
     closed loop. The first moment comes with no reward: NaN stands there.
     """
-    is_first = jnp.arange(len(seen)) == 0
+    is_first = jnp.arange(len(observed)) == 0
 
     def step(before: tuple[Array, Array], inputs: tuple) -> tuple[tuple[Array, Array], Gaussian]:
-        x, prev_action, is_first, seen, noise = inputs
+        x, prev_action, is_first, observed, noise = inputs
         known = jnp.concatenate([is_first[None].astype(x.dtype), prev_action])
         q, p = model.posterior(x, known, before[1]), model.prior(before[1], prev_action)
         p = Gaussian(jnp.where(is_first, 0.0, p.mean), jnp.where(is_first, 1.0, p.sigma))
-        of_z1 = jax.tree.map(lambda posterior, prior: jnp.where(seen, posterior, prior), q, p)
+        of_z1 = jax.tree.map(lambda posterior, prior: jnp.where(observed, posterior, prior), q, p)
         z1 = of_z1.mean + of_z1.sigma * noise[0]
         of_z2 = model.next_z2(known, z1, before[1])
         z2 = of_z2.mean + of_z2.sigma * noise[1]
@@ -146,16 +146,16 @@ def predict(
         both = jax.tree.map(lambda *parts: jnp.concatenate(parts), model.decoder(z1, z2), reward)
         return (z1, z2), both
 
-    start, x = (jnp.zeros_like(noise[0][0]), jnp.zeros_like(noise[1][0])), jnp.where(seen[:, None], x, 0.0)
-    return jax.lax.scan(step, start, (x, prev_action, is_first, seen, noise))[1]
+    start, x = (jnp.zeros_like(noise[0][0]), jnp.zeros_like(noise[1][0])), jnp.where(observed[:, None], x, 0.0)
+    return jax.lax.scan(step, start, (x, prev_action, is_first, observed, noise))[1]
 
 
-class Loop(NamedTuple):
+class LatentLoopWeights(NamedTuple):
     """The weights that stay inside the loop; of the two networks only what is behind their first layers."""
 
-    by_z2: Float[Array, "z2 hidden"]
-    by_z1: Float[Array, "z1 hidden"]
-    next_by_z2: Float[Array, "z2 hidden"]
+    w_z2: Float[Array, "z2 hidden"]
+    w_z1: Float[Array, "z1 hidden"]
+    w_next_z2: Float[Array, "z2 hidden"]
     posterior: GaussianMLP
     next_z2: GaussianMLP
 
@@ -163,9 +163,9 @@ class Loop(NamedTuple):
 def _cell(weights, before, given, zeros, is_first, noise):
     """One moment: the latent variables, and what each later layer of both networks was given."""
     before = jnp.where(is_first[:, None], 0.0, before)
-    q, inputs1 = weights.posterior.rest(given[0] + before @ weights.by_z2, zeros[0])
+    q, inputs1 = weights.posterior.rest(given[0] + before @ weights.w_z2, zeros[0])
     z1 = q.mean + q.sigma * noise[0]
-    p, inputs2 = weights.next_z2.rest(given[1] + z1 @ weights.by_z1 + before @ weights.next_by_z2, zeros[1])
+    p, inputs2 = weights.next_z2.rest(given[1] + z1 @ weights.w_z1 + before @ weights.w_next_z2, zeros[1])
     z2 = p.mean + p.sigma * noise[1]
     return z2, (Latents(q, z1, before, z2), (inputs1, inputs2))
 
@@ -200,32 +200,32 @@ def _loop_forward(weights, given, is_first, noise):
 
 def _loop_backward(saved, cotangent):
     weights, latents, inputs, pullback = saved
-    by_given, by_outputs = pullback((cotangent, jax.tree.map(jnp.zeros_like, inputs)))
+    grad_given, grad_outputs = pullback((cotangent, jax.tree.map(jnp.zeros_like, inputs)))
 
     def product(left, right):
         return jnp.einsum("tbm,tbn->mn", left, right)
 
-    def gradient(network, inputs, by_outputs):
+    def gradient(network, inputs, grad_outputs):
         first = network.mlp.layers[0]  # its gradient goes by the other entries
-        by_layers = [jnp.zeros_like(first.weight), jnp.zeros_like(first.bias)]
-        for x, by in zip(inputs, by_outputs, strict=True):
-            by_layers += [product(by, x), jnp.sum(by, (0, 1))]
-        return eqx.tree_at(lambda network: jax.tree.leaves(network.mlp.layers), network, by_layers)
+        grad_layers = [jnp.zeros_like(first.weight), jnp.zeros_like(first.bias)]
+        for x, grad_output in zip(inputs, grad_outputs, strict=True):
+            grad_layers += [product(grad_output, x), jnp.sum(grad_output, (0, 1))]
+        return eqx.tree_at(lambda network: jax.tree.leaves(network.mlp.layers), network, grad_layers)
 
-    by_weights = Loop(
-        product(latents.before, by_given[0]),
-        product(latents.z1, by_given[1]),
-        product(latents.before, by_given[1]),
-        gradient(weights.posterior, inputs[0], by_outputs[0]),
-        gradient(weights.next_z2, inputs[1], by_outputs[1]),
+    grad_weights = LatentLoopWeights(
+        product(latents.before, grad_given[0]),
+        product(latents.z1, grad_given[1]),
+        product(latents.before, grad_given[1]),
+        gradient(weights.posterior, inputs[0], grad_outputs[0]),
+        gradient(weights.next_z2, inputs[1], grad_outputs[1]),
     )
-    return by_weights, by_given, None, None
+    return grad_weights, grad_given, None, None
 
 
 _loop.defvjp(_loop_forward, _loop_backward)
 
 
-class Terms(NamedTuple):
+class LatentElboTerms(NamedTuple):
     """The terms of the ELBO at every moment, summed over dimensions."""
 
     kl: Float[Array, "time batch"]
@@ -240,7 +240,7 @@ def elbo_terms(
     reward: Float[Array, "time batch"],
     prev_action: Float[Array, "time batch action"],
     is_first: Bool[Array, "time batch"],
-) -> Terms:
+) -> LatentElboTerms:
     """The terms of the ELBO of windows whose latent variables were inferred."""
     first = is_first[..., None]
     prior = model.prior(latents.before, prev_action)
@@ -251,4 +251,4 @@ def elbo_terms(
     moved = (latents.z1[:-1], latents.z2[:-1], prev_action[1:], latents.z1[1:], latents.z2[1:])
     log_reward = gaussian_log_prob(reward[1:, :, None], *model.reward(*moved))
     log_reward = jnp.where(first[1:], 0.0, log_reward)[..., 0]
-    return Terms(kl, log_obs, jnp.concatenate([jnp.zeros_like(log_reward[:1]), log_reward]))
+    return LatentElboTerms(kl, log_obs, jnp.concatenate([jnp.zeros_like(log_reward[:1]), log_reward]))

@@ -55,7 +55,7 @@ class MLP(eqx.Module):
         return self.rest(self.layers[0](x))
 
     def rest(self, first: Float[Array, " hidden"]) -> Float[Array, " output"]:
-        """The output, from what the first layer gave: for callers that computed that product elsewhere."""
+        """The output, given the first layer's: for callers that compute the first product elsewhere."""
         for layer in self.layers[1:]:
             first = layer(self.activation(first))
         return first
@@ -64,7 +64,7 @@ class MLP(eqx.Module):
 def draw(key: Key[Array, ""], bounds: Params) -> Params:
     """Weights uniform in ±bound, for every number in a tree of bounds.
 
-    All come from one draw: XLA compiles every draw of another shape by itself, a quarter of a second each.
+    All weights come from one random draw: XLA compiles a draw for each shape, a quarter of a second each.
     """
     leaves, structure = jax.tree.flatten(bounds)
     numbers = jax.random.uniform(key, (sum(leaf.size for leaf in leaves),), minval=-1.0)
@@ -73,7 +73,7 @@ def draw(key: Key[Array, ""], bounds: Params) -> Params:
 
 
 class LSTMState(NamedTuple):
-    """What an LSTM remembers; zeros where an episode begins."""
+    """The state of an LSTM; zeros where an episode begins."""
 
     d: Float[Array, "*batch d"]  # its output, the recurrent state of the paper
     c: Float[Array, "*batch d"]  # its cell
@@ -86,7 +86,7 @@ def lstm_state(gates: Float[Array, "*lead gates"], c: Float[Array, "*lead d"]) -
     c' = σ(f) c + σ(i) tanh g,   d' = σ(o) tanh c'
 
     One tanh serves all four, as σ(x) = ½ tanh(x/2) + ½: XLA vectorises it over the whole array, which it does not
-    do for four functions of slices (5 times slower); the gradient is written out for the same reason.
+    do for four functions of slices (5 times slower); the gradient is written by hand for the same reason.
     """
     return _lstm_forward(gates, c)[0]
 
@@ -105,10 +105,15 @@ def _lstm_forward(gates, c):
 
 def _lstm_backward(saved, cotangents):
     i, f, g, o, c, tanh_c = saved
-    by_d, by_c = cotangents
-    by_c = by_c + by_d * o * (1 - tanh_c**2)
-    by_gates = (by_c * g * i * (1 - i), by_c * c * f * (1 - f), by_c * i * (1 - g**2), by_d * tanh_c * o * (1 - o))
-    return jnp.concatenate(by_gates, axis=-1), by_c * f
+    grad_d, grad_c = cotangents
+    grad_c = grad_c + grad_d * o * (1 - tanh_c**2)
+    grad_gates = (
+        grad_c * g * i * (1 - i),
+        grad_c * c * f * (1 - f),
+        grad_c * i * (1 - g**2),
+        grad_d * tanh_c * o * (1 - o),
+    )
+    return jnp.concatenate(grad_gates, axis=-1), grad_c * f
 
 
 lstm_state.defvjp(_lstm_forward, _lstm_backward)
@@ -117,55 +122,55 @@ lstm_state.defvjp(_lstm_forward, _lstm_backward)
 class LSTM(eqx.Module):
     """An LSTM over time. Its weights are stored input by output, as the loop multiplies them; gates i, f, g, o."""
 
-    by_x: Float[Array, "input 4*d"]
-    by_d: Float[Array, "d 4*d"]
+    w_x: Float[Array, "input 4*d"]
+    w_d: Float[Array, "d 4*d"]
     bias: Float[Array, " 4*d"]
 
     def __init__(self, inputs: int, d: int):
-        self.by_x = jnp.full((inputs, 4 * d), d**-0.5)
-        self.by_d = jnp.full((d, 4 * d), d**-0.5)
+        self.w_x = jnp.full((inputs, 4 * d), d**-0.5)
+        self.w_d = jnp.full((d, 4 * d), d**-0.5)
         self.bias = jnp.full((4 * d,), d**-0.5)
 
     def start(self, batch: int) -> LSTMState:
         """The state in which episodes begin."""
-        zeros = jnp.zeros((batch, self.by_d.shape[0]))
+        zeros = jnp.zeros((batch, self.w_d.shape[0]))
         return LSTMState(zeros, zeros)
 
     def unroll(
         self, start: LSTMState, x: Float[Array, "time batch input"], is_first: Bool[Array, "time batch"]
     ) -> LSTMState:
         """The states at every step, from `start` and from zero wherever is_first; leaves (time, batch, d)."""
-        given = x @ self.by_x
-        return _lstm_loop(self.by_d, start, given + jnp.broadcast_to(self.bias, given.shape), is_first)[1]
+        given = x @ self.w_x
+        return _lstm_loop(self.w_d, start, given + jnp.broadcast_to(self.bias, given.shape), is_first)[1]
 
 
-def _lstm_scan(by_d, start, given, is_first):
+def _lstm_scan(w_d, start, given, is_first):
     """d_{t-1} and the state after it, at every step."""
 
     def step(state, inputs):
         given, is_first = inputs
         before = jax.tree.map(lambda leaf: jnp.where(is_first[:, None], 0.0, leaf), state)
-        state = LSTMState(*lstm_state(given + before.d @ by_d, before.c))
+        state = LSTMState(*lstm_state(given + before.d @ w_d, before.c))
         return state, (before.d, state)
 
     return jax.lax.scan(step, start, (given, is_first))[1]
 
 
 @jax.custom_vjp
-def _lstm_loop(by_d, start, given, is_first):
-    return _lstm_scan(by_d, start, given, is_first)
+def _lstm_loop(w_d, start, given, is_first):
+    return _lstm_scan(w_d, start, given, is_first)
 
 
-def _lstm_loop_forward(by_d, start, given, is_first):
-    result, pullback = jax.vjp(lambda start, given: _lstm_scan(by_d, start, given, is_first), start, given)
+def _lstm_loop_forward(w_d, start, given, is_first):
+    result, pullback = jax.vjp(lambda start, given: _lstm_scan(w_d, start, given, is_first), start, given)
     return result, (result[0], pullback)
 
 
 def _lstm_loop_backward(saved, cotangent):
-    """The gradient of by_d is one product after the loop; plain differentiation would add one up at every step."""
+    """The gradient of w_d is one product after the loop; plain differentiation would add one up at every step."""
     before, pullback = saved
-    by_start, by_given = pullback(cotangent)
-    return jnp.einsum("tbm,tbn->mn", before, by_given), by_start, by_given, None
+    grad_start, grad_given = pullback(cotangent)
+    return jnp.einsum("tbm,tbn->mn", before, grad_given), grad_start, grad_given, None
 
 
 _lstm_loop.defvjp(_lstm_loop_forward, _lstm_loop_backward)
@@ -215,37 +220,41 @@ def descend(
     return optax.apply_updates(tree, updates), state  # pyright: ignore[reportReturnType]
 
 
-class Scale(NamedTuple):
-    """Running moments of a vector that changes while it is learned."""
+class RunningStatistics(NamedTuple):
+    """Running mean and variance of each entry of a vector."""
 
     mean: Float[Array, " size"]
     variance: Float[Array, " size"]
-    seen: Float[Array, ""]  # how many batches
+    batches: Float[Array, ""]  # batches so far
 
 
-SCALE_RATE = 1e-3  # of a batch, once there were as many
-QUIETEST = 1e-3  # added to deviations: what varies less stays quieter
-LOUDEST = 10.0
+STATISTICS_RATE = 1e-3  # least weight of a new batch, reached after 1 / rate batches
+DEVIATION_MIN = 1e-3  # added to deviations: entries that vary less than this stay small
+STANDARDISED_MAX = 10.0
 
 
-def unscaled(size: int) -> Scale:
-    """Of nothing yet: mean 0, variance 1."""
-    return Scale(jnp.zeros(size), jnp.ones(size), jnp.zeros(()))
+def initial_statistics(size: int) -> RunningStatistics:
+    """Before any batch: mean 0, variance 1."""
+    return RunningStatistics(jnp.zeros(size), jnp.ones(size), jnp.zeros(()))
 
 
-def observe(scale: Scale, x: Float[Array, "*batch size"], valid: Bool[Array, "*batch"]) -> Scale:
-    """With the valid vectors of one more batch; at first every batch counts alike, later the last ones more."""
-    seen = scale.seen + 1
-    rate, flat, weight = jnp.maximum(1 / seen, SCALE_RATE), x.reshape(-1, x.shape[-1]), valid.ravel()
+def update_statistics(
+    statistics: RunningStatistics, x: Float[Array, "*batch size"], valid: Bool[Array, "*batch"]
+) -> RunningStatistics:
+    """Include the valid vectors of one more batch: an average over batches, exponential after 1 / STATISTICS_RATE."""
+    batches = statistics.batches + 1
+    rate, flat, weight = jnp.maximum(1 / batches, STATISTICS_RATE), x.reshape(-1, x.shape[-1]), valid.ravel()
     weight = weight / jnp.maximum(jnp.sum(weight), 1)
-    mean = scale.mean + rate * (weight @ flat - scale.mean)
-    variance = scale.variance + rate * (weight @ (flat - mean[None]) ** 2 - scale.variance)
-    return Scale(mean, variance, seen)
+    mean = statistics.mean + rate * (weight @ flat - statistics.mean)
+    variance = statistics.variance + rate * (weight @ (flat - mean[None]) ** 2 - statistics.variance)
+    return RunningStatistics(mean, variance, batches)
 
 
-def standardised(scale: Scale | None, x: Float[Array, "*batch size"]) -> Float[Array, "*batch size"]:
-    """x with mean 0 and deviation 1, entries in [-10, 10]; without a scale x itself."""
-    if scale is None:
+def standardise(statistics: RunningStatistics | None, x: Float[Array, "*batch size"]) -> Float[Array, "*batch size"]:
+    """x with mean 0 and deviation 1, entries in [-10, 10]; x itself where `statistics` is None."""
+    if statistics is None:
         return x
-    mean, deviation = (jnp.broadcast_to(v, x.shape) for v in (scale.mean, jnp.sqrt(scale.variance) + QUIETEST))
-    return jnp.clip((x - mean) / deviation, -LOUDEST, LOUDEST)
+    mean, deviation = (
+        jnp.broadcast_to(v, x.shape) for v in (statistics.mean, jnp.sqrt(statistics.variance) + DEVIATION_MIN)
+    )
+    return jnp.clip((x - mean) / deviation, -STANDARDISED_MAX, STANDARDISED_MAX)

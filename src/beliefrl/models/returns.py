@@ -58,11 +58,11 @@ def transition_batch(
     next_belief: Float[Array, "time batch belief"],
     n: int,
     gamma: float,
-    seen: Float[Array, "time batch seen"] | None = None,
+    actor_input: Float[Array, "time batch actor_input"] | None = None,
 ) -> Batch:
     """The transitions between length + 1 moments of windows (time-major), leaves (length, batch, ...).
 
-    `next_belief` holds the beliefs that V̄ reads, at the same moments; `seen` what the actor reads where not `belief`.
+    `next_belief` holds the inputs of V̄ at the same moments; `actor_input` the actor's where not `belief`.
     """
     returns = n_step_returns(step, valid, n, gamma)
     after = next_belief[1:] if n == 1 else jnp.take_along_axis(next_belief, returns.end[..., None], axis=0)
@@ -73,6 +73,6 @@ def transition_batch(
         reward=returns.reward,
         terminated=returns.terminated,
         valid=valid,
-        seen=None if seen is None else seen[:-1],
+        actor_input=None if actor_input is None else actor_input[:-1],
         discount=returns.discount,
     )

@@ -48,8 +48,8 @@ def q_value(
 ) -> Float[Array, " batch"]:
     """Q(s, a). The first layer is taken apart so that one W_s s serves Q(s, a) and Q(s, ã)."""
     first, size = critic.layers[0], belief.shape[-1]
-    seen = belief @ first.weight[:, :size].T
-    return jax.vmap(lambda s, a: critic.rest(s + first.weight[:, size:] @ a + first.bias)[0])(seen, action)
+    projected = belief @ first.weight[:, :size].T
+    return jax.vmap(lambda s, a: critic.rest(s + first.weight[:, size:] @ a + first.bias)[0])(projected, action)
 
 
 def state_value(value: MLP, belief: Float[Array, "batch belief"]) -> Float[Array, " batch"]:
@@ -79,9 +79,9 @@ class Batch(NamedTuple):
     action: Float[Array, "batch action"]  # a_t
     reward: Float[Array, " batch"]  # r_t, or the discounted sum of m of them
     terminated: Bool[Array, " batch"]  # `next_belief` is terminal
-    valid: Bool[Array, " batch"]  # what is not counts nowhere
-    seen: Float[Array, "batch seen"] | None = None  # what the actor reads where that is not s_t (SLAC)
-    discount: Float[Array, " batch"] | None = None  # γ^m of what lies beyond; None: γ
+    discount: Float[Array, " batch"]  # γ^m of the value at `next_belief`
+    valid: Bool[Array, " batch"]  # mask: False entries are ignored
+    actor_input: Float[Array, "batch actor_input"] | None = None  # the actor's input where that is not s_t (SLAC)
 
 
 def init_controller(
@@ -90,14 +90,14 @@ def init_controller(
     policy_layers: tuple[int, ...],
     value_layers: tuple[int, ...],
     key: Key[Array, ""],
-    seen: int | None = None,
+    actor_size: int | None = None,
     value_start: float = 0.0,
 ) -> Controller:
     """A new controller for beliefs and actions of these sizes; V̄ starts as V, log α at 0.
 
-    `seen` is the size of what the actor reads, where that is not the belief; `value_start` is added to V and Q.
+    `actor_size` is the size of the actor's input where that is not the belief; `value_start` is added to V and Q.
     """
-    actor = Actor(belief if seen is None else seen, action, policy_layers)
+    actor = Actor(belief if actor_size is None else actor_size, action, policy_layers)
     critic = MLP((belief + action, *value_layers, 1), jax.nn.relu)
     value = MLP((belief, *value_layers, 1), jax.nn.relu)
     controller = draw(key, Controller(actor, (critic, critic), value, value, jnp.zeros(())))
@@ -110,7 +110,7 @@ def _last_biases(controller: Controller) -> list[Any]:
 
 
 def valid_mean(x: Float[Array, " batch"], valid: Bool[Array, " batch"]) -> Float[Array, ""]:
-    """The mean over what is valid; 0 where nothing is."""
+    """The mean of the valid entries; 0 where none is valid."""
     return jnp.sum(jnp.where(valid, x, 0.0)) / jnp.maximum(jnp.sum(valid), 1)
 
 
@@ -121,11 +121,10 @@ def value_loss(
     return valid_mean(0.5 * (state_value(value, belief) - target) ** 2, valid)
 
 
-def q_loss(critics: tuple[MLP, MLP], target_value: MLP, batch: Batch, gamma: float) -> Float[Array, ""]:
+def q_loss(critics: tuple[MLP, MLP], target_value: MLP, batch: Batch) -> Float[Array, ""]:
     """J_Q of both critics, summed."""
-    discount = gamma if batch.discount is None else batch.discount
-    beyond = jnp.where(batch.terminated, 0.0, state_value(target_value, batch.next_belief))
-    target = jax.lax.stop_gradient(batch.reward + discount * beyond)
+    next_value = jnp.where(batch.terminated, 0.0, state_value(target_value, batch.next_belief))
+    target = jax.lax.stop_gradient(batch.reward + batch.discount * next_value)
     errors = [q_value(critic, batch.belief, batch.action) - target for critic in critics]
     return valid_mean(0.5 * errors[0] ** 2 + 0.5 * errors[1] ** 2, batch.valid)
 
@@ -133,8 +132,8 @@ def q_loss(critics: tuple[MLP, MLP], target_value: MLP, batch: Batch, gamma: flo
 def actor_loss(
     actor: Actor, controller: Controller, batch: Batch, noise: Float[Array, "batch action"], regulariser: float
 ) -> tuple[Float[Array, ""], tuple[Float[Array, " batch"], Float[Array, " batch"]]]:
-    """J_π; beside it min_i Q_i(s, ã) and log π(ã|s). The belief that Q reads is held still: Q is not to improve."""
-    mean, log_sigma = jax.vmap(actor)(batch.belief if batch.seen is None else batch.seen)
+    """J_π; beside it min_i Q_i(s, ã) and log π(ã|s). No gradient flows into the belief through Q."""
+    mean, log_sigma = jax.vmap(actor)(batch.belief if batch.actor_input is None else batch.actor_input)
     action, log_prob = jax.vmap(tanh_gaussian)(mean, log_sigma, noise)
     q = controller.q(jax.lax.stop_gradient(batch.belief), action)
     size = jnp.mean(mean**2, axis=-1) + jnp.mean(jnp.exp(2 * log_sigma), axis=-1)
@@ -153,22 +152,21 @@ def loss(
     controller: Controller,
     batch: Batch,
     noise: Float[Array, "batch action"],
-    gamma: float,
     regulariser: float,
     target_entropy: float | None = None,
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-    """J_π + J_V + J_Q + J_α, in each of which all that it does not train is held still; and what to log.
+    """J_π + J_V + J_Q + J_α, with stop_gradient on all that a loss does not train; and what to log.
 
     So its gradient is that of the four losses at the same parameters (V̄'s is zero), and where the beliefs are formed
     by a network that learns as well (`sac-lstm`), the gradient of J_π, J_V and J_Q in it. `noise` is standard normal,
     one vector a transition: the sample ã. `target_entropy` None is -DOF.
     """
-    still = jax.lax.stop_gradient(controller)
-    j_pi, extras = actor_loss(controller.actor, still, batch, noise, regulariser)
+    fixed = jax.lax.stop_gradient(controller)
+    j_pi, extras = actor_loss(controller.actor, fixed, batch, noise, regulariser)
     q, log_prob = jax.lax.stop_gradient(extras)
-    alpha = jnp.exp(still.log_alpha)
+    alpha = jnp.exp(fixed.log_alpha)
     j_v = value_loss(controller.value, batch.belief, q - alpha * log_prob, batch.valid)
-    j_q = q_loss(controller.critics, still.target_value, batch, gamma)
+    j_q = q_loss(controller.critics, fixed.target_value, batch)
     target_entropy = -float(batch.action.shape[-1]) if target_entropy is None else target_entropy
     j_alpha = alpha_loss(controller.log_alpha, log_prob, batch.valid, target_entropy)
     metrics = {
@@ -183,7 +181,7 @@ def loss(
 
 
 def soft_update(target: Network, value: Network, tau: float) -> Network:
-    """A target network, such as V̄, moves by the fraction τ towards the one that learns."""
+    """Move a target network, such as V̄, by the fraction τ towards the one that is trained."""
     return jax.tree.map(lambda old, new: old + tau * (new - old), target, value)
 
 

@@ -43,33 +43,33 @@ class Joint(eqx.Module):
     Stored input by output, as the loop multiplies them; what an output does not read has no weights here.
     """
 
-    by_d: Float[Array, "d joint"]
-    by_features: Float[Array, "hidden joint"]
-    by_action: Float[Array, "action 2*hidden"]  # the posterior alone
-    by_z: Float[Array, "z 4*d"]  # the gates alone
+    w_d: Float[Array, "d joint"]
+    w_features: Float[Array, "hidden joint"]
+    w_action: Float[Array, "action 2*hidden"]  # the posterior alone
+    w_z: Float[Array, "z 4*d"]  # the gates alone
     bias: Float[Array, " joint"]
 
     def __init__(self, action: int, d: int, z: int, hidden: int):
         posterior, gates = (d + action + hidden) ** -0.5, d**-0.5  # PyTorch's bounds for a linear layer and an LSTM
         self.bias = jnp.concatenate([jnp.full(2 * hidden, posterior), jnp.full(4 * d, gates)])
-        self.by_d = jnp.tile(self.bias, (d, 1))
-        self.by_features = jnp.tile(self.bias, (hidden, 1))
-        self.by_action = jnp.full((action, 2 * hidden), posterior)
-        self.by_z = jnp.full((z, 4 * d), gates)
+        self.w_d = jnp.tile(self.bias, (d, 1))
+        self.w_features = jnp.tile(self.bias, (hidden, 1))
+        self.w_action = jnp.full((action, 2 * hidden), posterior)
+        self.w_z = jnp.full((z, 4 * d), gates)
 
     def given(
         self,
         features: Float[Array, "time batch hidden"],
         prev_action: Float[Array, "time batch action"],
-        posterior_sees: bool = True,
+        posterior_reads_x: bool = True,
     ) -> Float[Array, "time batch joint"]:
         """What the layer gets from f_x(x_t) and a_{t-1}; without f_x(x_t) for the posterior unless it sees it."""
-        posterior = prev_action @ self.by_action
-        gates = jnp.zeros((*posterior.shape[:-1], self.by_z.shape[1]))
-        by_features = self.by_features
-        if not posterior_sees:
-            by_features = by_features.at[:, : posterior.shape[-1]].set(0.0)
-        everything = features @ by_features + jnp.concatenate([posterior, gates], axis=-1)
+        posterior = prev_action @ self.w_action
+        gates = jnp.zeros((*posterior.shape[:-1], self.w_z.shape[1]))
+        w_features = self.w_features
+        if not posterior_reads_x:
+            w_features = w_features.at[:, : posterior.shape[-1]].set(0.0)
+        everything = features @ w_features + jnp.concatenate([posterior, gates], axis=-1)
         return everything + jnp.broadcast_to(self.bias, everything.shape)
 
 
@@ -105,7 +105,7 @@ class VRM(eqx.Module):
 
     def start(self, batch: int) -> LSTMState:
         """The state in which episodes begin."""
-        zeros = jnp.zeros((batch, self.joint.by_d.shape[0]))
+        zeros = jnp.zeros((batch, self.joint.w_d.shape[0]))
         return LSTMState(zeros, zeros)
 
     def prior(self, before: Float[Array, " d"], prev_action: Float[Array, " action"]) -> Gaussian:
@@ -129,45 +129,45 @@ class VRM(eqx.Module):
         """Unroll the inference model with z_t = μ_q + σ_q · noise_t, from `start` and from zero wherever is_first."""
         given = self.joint.given(jax.vmap(jax.vmap(self.features))(x), prev_action, not self.deterministic)
         noise = jnp.zeros_like(noise) if self.deterministic else noise
-        weights = Loop(self.joint.by_d, self.joint.by_z, self.posterior_mean, self.posterior_sigma)
+        weights = VRMLoopWeights(self.joint.w_d, self.joint.w_z, self.posterior_mean, self.posterior_sigma)
         return _loop(weights, start, given, is_first, noise)
 
     def next_state(self, state: LSTMState, x: Float[Array, " x"], z: Float[Array, " z"]) -> LSTMState:
         """d_t and its cell, from d_{t-1} and its cell."""
-        joint, gates = self.joint, slice(-self.joint.by_z.shape[1], None)
-        given = self.features(x) @ joint.by_features[:, gates] + state.d @ joint.by_d[:, gates] + joint.bias[gates]
-        return LSTMState(*lstm_state(given + z @ joint.by_z, state.c))
+        joint, gates = self.joint, slice(-self.joint.w_z.shape[1], None)
+        given = self.features(x) @ joint.w_features[:, gates] + state.d @ joint.w_d[:, gates] + joint.bias[gates]
+        return LSTMState(*lstm_state(given + z @ joint.w_z, state.c))
 
 
 def predict(
     vrm: VRM,
     x: Float[Array, "time x"],
     prev_action: Float[Array, "time action"],
-    seen: Bool[Array, " time"],
+    observed: Bool[Array, " time"],
     noise: tuple[Float[Array, "time z"], Float[Array, "time x"]],
 ) -> Gaussian:
     """p(x_t | z_t, d_{t-1}) along one episode from its first moment on, leaves (time, x).
 
-    Where x_t is `seen`, z_t is drawn from the posterior: open loop. Where it is not, z_t is drawn from the prior, and
-    the LSTM is fed with a draw of x_t from the decoder: closed loop. A deterministic model has σ = 0.
+    Where x_t is `observed`, z_t is drawn from the posterior: open loop. Elsewhere z_t is drawn from the prior, and the
+    LSTM reads a draw of x_t from the decoder: closed loop. A deterministic model has σ = 0.
     """
 
     def step(state: LSTMState, inputs: tuple) -> tuple[LSTMState, Gaussian]:
-        x, prev_action, seen, (noise_z, noise_x) = inputs
+        x, prev_action, observed, (noise_z, noise_x) = inputs
         moment = jax.tree.map(lambda leaf: leaf[None, None], (x, prev_action, jnp.array(False), noise_z))
         z = vrm.infer(jax.tree.map(lambda leaf: leaf[None], state), *moment).z[0, 0]
         if not vrm.deterministic:  # there posterior and prior are one
             prior = vrm.prior(state.d, prev_action)
-            z = jnp.where(seen, z, prior.mean + prior.sigma * noise_z)
+            z = jnp.where(observed, z, prior.mean + prior.sigma * noise_z)
         mean, sigma = vrm.decode(state.d, z)
         sigma = jnp.zeros_like(sigma) if vrm.deterministic else sigma
-        return vrm.next_state(state, jnp.where(seen, x, mean + sigma * noise_x), z), Gaussian(mean, sigma)
+        return vrm.next_state(state, jnp.where(observed, x, mean + sigma * noise_x), z), Gaussian(mean, sigma)
 
-    start, x = jax.tree.map(lambda leaf: leaf[0], vrm.start(1)), jnp.where(seen[:, None], x, 0.0)
-    return jax.lax.scan(step, start, (x, prev_action, seen, noise))[1]
+    start, x = jax.tree.map(lambda leaf: leaf[0], vrm.start(1)), jnp.where(observed[:, None], x, 0.0)
+    return jax.lax.scan(step, start, (x, prev_action, observed, noise))[1]
 
 
-class Terms(NamedTuple):
+class VRMElboTerms(NamedTuple):
     """The two terms of the ELBO at every step, each summed or averaged over its dimensions."""
 
     kl: Float[Array, "time batch"]  # D_KL(q ‖ p)
@@ -181,7 +181,7 @@ def elbo_terms(
     prev_action: Float[Array, "time batch action"],
     scaling: str = "mean",
     prior_noise: Float[Array, "time batch z"] | None = None,
-) -> Terms:
+) -> VRMElboTerms:
     """Both terms of the ELBO of an unroll.
 
     `scaling` "mean" averages over the dimensions of z and x as the authors' code does (their learning rate was tuned
@@ -192,7 +192,7 @@ def elbo_terms(
     decoded = jax.vmap(jax.vmap(vrm.decode))(inferred.before, z)
     reduce = {"mean": jnp.mean, "sum": jnp.sum}[scaling]
     kl = reduce(gaussian_kl(*inferred.posterior, *prior), axis=-1)
-    return Terms(kl, reduce(gaussian_log_prob(x, *decoded), axis=-1))
+    return VRMElboTerms(kl, reduce(gaussian_log_prob(x, *decoded), axis=-1))
 
 
 def prediction_error(vrm: VRM, inferred: Inferred, x: Float[Array, "time batch x"]) -> Float[Array, "time batch"]:
@@ -201,11 +201,11 @@ def prediction_error(vrm: VRM, inferred: Inferred, x: Float[Array, "time batch x
     return jnp.mean((predicted - x) ** 2, axis=-1)
 
 
-class Loop(NamedTuple):
+class VRMLoopWeights(NamedTuple):
     """The weights that stay inside the loop."""
 
-    by_d: Float[Array, "d joint"]
-    by_z: Float[Array, "z 4*d"]
+    w_d: Float[Array, "d joint"]
+    w_z: Float[Array, "z 4*d"]
     mean: Linear
     sigma: Linear
 
@@ -220,14 +220,14 @@ class Hidden(NamedTuple):
 def _cell(weights, state, given, zero, is_first, noise):
     """One step. `zero` is added to the outputs of the posterior's last layers: its cotangent is theirs."""
     before = jax.tree.map(lambda leaf: jnp.where(is_first[:, None], 0.0, leaf), state)
-    pre = given + before.d @ weights.by_d
+    pre = given + before.d @ weights.w_d
     hidden = weights.mean.weight.shape[1]
     first = jnp.tanh(pre[:, : 2 * hidden])
     hidden_mean, hidden_sigma = first[:, :hidden], first[:, hidden:]
     mean = jax.vmap(weights.mean)(hidden_mean) + zero.mean
     sigma = jax.nn.softplus(jax.vmap(weights.sigma)(hidden_sigma) + zero.sigma)
     z = mean + sigma * noise
-    state = LSTMState(*lstm_state(pre[:, 2 * hidden :] + z @ weights.by_z, before.c))
+    state = LSTMState(*lstm_state(pre[:, 2 * hidden :] + z @ weights.w_z, before.c))
     return state, (Inferred(Gaussian(mean, sigma), z, before.d, state), Hidden(hidden_mean, hidden_sigma))
 
 
@@ -253,7 +253,7 @@ def _loop_forward(weights, start, given, is_first, noise):
 
 def _loop_backward(saved, cotangent):
     weights, inferred, hidden, pullback = saved
-    by_start, by_given, by_last = pullback((cotangent, jax.tree.map(jnp.zeros_like, hidden)))
+    grad_start, grad_given, grad_last = pullback((cotangent, jax.tree.map(jnp.zeros_like, hidden)))
 
     def product(left, right):
         return jnp.einsum("tbm,tbn->mn", left, right)
@@ -262,14 +262,14 @@ def _loop_backward(saved, cotangent):
         gradient = (product(outputs, inputs), jnp.sum(outputs, (0, 1)))
         return eqx.tree_at(lambda layer: (layer.weight, layer.bias), linear, gradient)
 
-    by_gates = by_given[..., -weights.by_z.shape[1] :]
-    by_weights = Loop(
-        product(inferred.before, by_given),
-        product(inferred.z, by_gates),
-        layer(weights.mean, hidden.mean, by_last.mean),
-        layer(weights.sigma, hidden.sigma, by_last.sigma),
+    grad_gates = grad_given[..., -weights.w_z.shape[1] :]
+    grad_weights = VRMLoopWeights(
+        product(inferred.before, grad_given),
+        product(inferred.z, grad_gates),
+        layer(weights.mean, hidden.mean, grad_last.mean),
+        layer(weights.sigma, hidden.sigma, grad_last.sigma),
     )
-    return by_weights, by_start, by_given, None, None
+    return grad_weights, grad_start, grad_given, None, None
 
 
 _loop.defvjp(_loop_forward, _loop_backward)

@@ -73,9 +73,8 @@ def matmul_gflops(size: int = 2048) -> float:
 
 
 def parameters(tree: Any) -> int:
-    """How many numbers the networks in an agent's state hold, optimisers apart."""
-    networks = [value for name, value in tree._asdict().items() if "optimiser" not in name]
-    return sum(leaf.size for leaf in jax.tree.leaves(networks))
+    """How many numbers the arrays of a tree hold."""
+    return sum(leaf.size for leaf in jax.tree.leaves(tree))
 
 
 class _Timed:
@@ -151,7 +150,7 @@ def _bench(agent: Agent, obs: int, actions: int, seeds: int, started: float) -> 
         "matmul_gflops": peak,
         "gflop_per_step": flop / 1e9,
         "share_of_peak": flop / whole / 1e9 / peak,
-        "parameters": parameters(timed.seeds.state) // seeds,
+        "parameters": parameters(agent.networks(timed.seeds.state)) // seeds,
         "obs": obs,
         "actions": actions,
         "seeds": seeds,

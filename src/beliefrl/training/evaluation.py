@@ -55,7 +55,7 @@ def restore(run: Run, task: Task | GymnasiumTask | None = None) -> tuple[Agent, 
     found = task_of(run) if task is None else task
     spec = found.spec
     keys = jax.random.split(jax.random.key(0), len(run.seeds))
-    like = jax.eval_shape(jax.vmap(lambda key: agent.init(key, spec)), keys)
+    like = jax.eval_shape(jax.vmap(lambda key: agent.networks(agent.init(key, spec))), keys)
     return agent, found, run.load(like), run.precision
 
 

@@ -124,7 +124,7 @@ class HostLoop:
 
     def explore(self, seeds: SeedState, first: int, steps: int) -> tuple[SeedState, Stretch]:
         """Environment steps without updates; none of them only compiles."""
-        told, deed, networks = _Told(), self._act(seeds, first), _networks(seeds.state)
+        told, deed, networks = _Told(), self._act(seeds, first), self.agent.networks(seeds.state)
         if steps == 0:
             self._compile(seeds, deed, learns=False)
         for step in range(first, first + steps):
@@ -142,7 +142,9 @@ class HostLoop:
         for step in range(first, first + cycles * cycle):
             answer = self._step(seeds, deed, step, told)
             if (step + 1 - first) % cycle:
-                rest, deed, episode = self._go_on(_networks(seeds.state), seeds._replace(state=()), answer, step)
+                rest, deed, episode = self._go_on(
+                    self.agent.networks(seeds.state), seeds._replace(state=()), answer, step
+                )
                 seeds = rest._replace(state=seeds.state)
             else:
                 seeds, deed, episode, metrics = self._learn(seeds, answer, step)
@@ -161,7 +163,7 @@ class HostLoop:
         answer = Answer(deed, obs, number, never, never, never, obs)
         if isinstance(self._go_on, jax.stages.Wrapped) and (self.agent.cycle > 1 or not learns):
             rest = seeds._replace(state=())
-            self._go_on = self._go_on.lower(_networks(seeds.state), rest, answer, 0).compile()
+            self._go_on = self._go_on.lower(self.agent.networks(seeds.state), rest, answer, 0).compile()
         if learns:
             self._learn = self._learn.lower(seeds, answer, 0).compile()
 
@@ -212,12 +214,6 @@ def _record(
     actor, replay = rollout.record(agent, seed.state, seed.replay, seed.actor, after, fresh, answer.done, key_last)
     episode = Episode(answer.done, after.total, after.length, answer.success)
     return seed._replace(actor=actor, replay=replay), episode
-
-
-def _networks(state: Any) -> Any:
-    """What of an agent's state acting needs: not the optimisers, hundreds of arrays that a call would look at."""
-    idle = [name for name in getattr(state, "_fields", ()) if "optimiser" in name]
-    return state._replace(**dict.fromkeys(idle, ())) if idle else state
 
 
 def _go_on(

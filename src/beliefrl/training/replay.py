@@ -38,47 +38,19 @@ def add(replay: Replay, moment: StoredTimestep, keep: Bool[Array, ""] | bool = T
 
 
 def sample(replay: Replay, key: Key[Array, ""], batch: int, shape: WindowShape) -> Window:
-    """Draw `batch` windows of burn_in + length + 1 moments, leaves (batch, time, ...).
+    """Draw `batch` windows of burn_in + length + 1 moments, leaves (time, batch, ...).
 
-    Of a shape with `one_episode`, what lies outside of the episode does not exist (`_in_episodes`). Of others:
     The first transition after the burn-in is uniform over all starts whose `length` transitions are stored, so
     every stored transition can be drawn. The burn-in overhangs where too little lies before it; with fewer moments
     than a window needs the rest overhangs as well. What overhangs is marked in `exists`.
     """
     oldest = jnp.maximum(replay.added - capacity(replay), 0)
     stored = replay.added - oldest
-    if shape.one_episode:
-        start, begin, end = _in_episodes(replay, oldest, key, batch, shape.length)
-    else:
-        start = jax.random.randint(key, (batch, 1), 0, jnp.maximum(stored - shape.length, 1))
-        begin, end = jnp.zeros_like(start), jnp.full_like(start, stored - 1)
-    position = start + jnp.arange(-shape.burn_in, shape.length + 1)[None]  # 0 is the oldest moment
+    start = jax.random.randint(key, (batch, 1), 0, jnp.maximum(stored - shape.length, 1)).T
+    position = start + jnp.arange(-shape.burn_in, shape.length + 1)[:, None]  # 0 is the oldest moment
     moments = gather(replay, oldest + position)
-    step = moments.step._replace(is_first=moments.step.is_first | (position <= begin))
-    return Window(step, moments.note, (position >= begin) & (position <= end))
-
-
-def _in_episodes(
-    replay: Replay, oldest: Int[Array, ""], key: Key[Array, ""], batch: int, length: int
-) -> tuple[Int[Array, "batch 1"], Int[Array, "batch 1"], Int[Array, "batch 1"]]:
-    """Where windows begin that are to lie in one episode, and its first and last moment (0 is the oldest).
-
-    As the authors' code draws them: episodes of T transitions in proportion to T + 2 length - 2, starts uniform from
-    length - 1 before the first transition to the last but one. Takes time in proportion to the ring.
-    """
-    key_episode, key_start = jax.random.split(key)
-    number = jnp.arange(capacity(replay))
-    exists = number < replay.added - oldest
-    first = (gather(replay, oldest + number).step.is_first & exists) | (number == 0)
-    weight = jnp.where(exists, 1 + first * (2 * length - 3), 0)
-    total = jnp.cumsum(weight)
-    drawn = jax.random.randint(key_episode, (batch, 1), 0, jnp.maximum(total[-1], 1))
-    moment = jnp.searchsorted(total, drawn, side="right")
-    begun = jax.lax.cummax(jnp.where(first, number, 0))
-    next_first = jax.lax.cummin(jnp.where(first, number, replay.added - oldest), reverse=True)
-    begin, end = begun[moment], jnp.append(next_first[1:], replay.added - oldest)[moment] - 1
-    start = jax.random.randint(key_start, (batch, 1), 1 - length, jnp.maximum(end - begin - 1, 2 - length))
-    return begin + start, begin, end
+    step = moments.step._replace(is_first=moments.step.is_first | (position <= 0))
+    return Window(step, moments.note, (position >= 0) & (position < stored))
 
 
 def gather(replay: Replay, number: Int[Array, "*shape"]) -> StoredTimestep:

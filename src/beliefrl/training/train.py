@@ -197,6 +197,8 @@ class _Training:
         self._look_for_divergence(event)
         if event.evaluation is not None and self.lost:
             event = event._replace(evaluation=log.without(event.evaluation, self.lost))
+        if event.states is not None:
+            event = event._replace(states=self.agent.networks(event.states))
         self.results = log.record(self.recorder, event, self.has_success, self.lost) or self.results
         self.report(event)
         if event.snapshot is not None:

@@ -1,4 +1,4 @@
-"""What all agents of the paper share: the hyperparameters of Table 1, and the controller that they describe."""
+"""The base class of the agents: the hyperparameters of Table 1 and the soft actor-critic that they describe."""
 
 import dataclasses
 from typing import Any
@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.models.nets import Scale, observe, standardised, tanh_gaussian
+from beliefrl.models.nets import RunningStatistics, standardise, tanh_gaussian, update_statistics
+from beliefrl.models.returns import transition_batch
 from beliefrl.models.soft_actor_critic import (
     Batch,
     Controller,
@@ -19,15 +20,15 @@ from beliefrl.models.soft_actor_critic import (
     loss,
     update,
 )
-from beliefrl.types import LARGEST, WIDEST, check_choice, check_range
+from beliefrl.types import LARGEST, WIDEST, Window, WindowShape, check_choice, check_range, transitions
 
 MOST_STEPS = 64  # of a return; each is compiled
 Metrics = dict[str, Float[Array, ""]]
 
 
 @dataclasses.dataclass(frozen=True)
-class SAC:
-    """A soft actor-critic, to be given beliefs (Table 1)."""
+class SACAgent:
+    """Base class of agents whose controller is a soft actor-critic on beliefs (Table 1)."""
 
     gamma: float = 0.99
     """Discount factor γ, in [0, 1] (Table 1)."""
@@ -36,11 +37,11 @@ class SAC:
     train_interval_rl: int = 1
     """Environment steps between two updates of the controller (Table 1)."""
     updates_per_step: int = 1
-    """Updates of the controller at each of these steps (Table 1: one). More learn in fewer steps, and take longer."""
+    """Updates of the controller at each of these steps (Table 1: one). More need fewer steps and more time a step."""
     n_step: int = 1
-    """Steps of the returns that the critics learn from (the paper: one). More speed up values over a long horizon."""
+    """Steps of the critics' n-step returns (the paper: one). More propagate rewards faster over a long horizon."""
     value_start: float = 0.0
-    """What V and Q say of everything before they learn, up to noise (the paper: 0), in units of the return."""
+    """Initial output of V and Q, up to noise from the initial weights (the paper: 0), in units of the return."""
     lr_actor: float = 3e-4
     """Adam's learning rate for the actor (Table 1)."""
     lr_critic: float = 3e-4
@@ -48,7 +49,7 @@ class SAC:
     lr_alpha: float = 3e-4
     """Adam's learning rate for log α, the temperature (Table 1)."""
     target_entropy: float | None = None
-    """Entropy that α steers to; None is minus the number of actions (Table 1)."""
+    """Entropy that α aims at; None is minus the number of actions (Table 1)."""
     tau: float = 0.005
     """Fraction by which the target V moves at each update, in [0, 1] (Table 1)."""
     policy_layers: tuple[int, ...] = (256, 256)
@@ -65,7 +66,7 @@ class SAC:
         check_range(self, ("n_step",), 1, MOST_STEPS)
         check_range(self, ("value_start",), -LARGEST)
         check_range(self, ("actor_regulariser",), 0)
-        check_range(self, ("step_start_rl",), 2)  # fewer moments hold no transition to learn from
+        check_range(self, ("step_start_rl",), 2)  # fewer moments hold no transition
         check_range(self, ("lr_actor", "lr_critic", "lr_alpha", "gamma", "tau"), 0, 1)
         if self.target_entropy is not None:
             check_range(self, ("target_entropy",), -LARGEST)
@@ -84,22 +85,31 @@ class SAC:
         return self.train_interval_rl
 
     @property
+    def window(self) -> WindowShape:
+        """The windows that the agent learns from."""
+        raise NotImplementedError
+
+    @property
     def optimisers(self) -> Optimisers:
         return Optimisers(optax.adam(self.lr_actor), optax.adam(self.lr_critic), optax.adam(self.lr_alpha))
 
     def init_controller(
-        self, key: Key[Array, ""], belief: int, action: int, seen: int | None = None
+        self, key: Key[Array, ""], belief: int, action: int, actor_size: int | None = None
     ) -> tuple[Controller, OptimiserState]:
-        """A new controller and its optimisers; `seen` is what the actor reads, where that is not the belief."""
+        """A new controller and its optimisers; `actor_size` is the actor's input size where that is not the belief."""
         sizes = belief, action, self.policy_layers, self.value_layers
-        controller = init_controller(*sizes, key, seen, self.value_start)
+        controller = init_controller(*sizes, key, actor_size, self.value_start)
         return controller, init_optimisers(self.optimisers, controller)
 
     def choose(
-        self, controller: Controller, seen: Float[Array, " seen"], key: Key[Array, ""], explore: Bool[Array, ""]
+        self,
+        controller: Controller,
+        actor_input: Float[Array, " actor_input"],
+        key: Key[Array, ""],
+        explore: Bool[Array, ""],
     ) -> Float[Array, " action"]:
         """An action: a sample of the policy, or its mode where not `explore`."""
-        mean, log_sigma = controller.actor(seen)
+        mean, log_sigma = controller.actor(actor_input)
         noise = jnp.where(explore, jax.random.normal(key, mean.shape), 0.0)
         return tanh_gaussian(mean, log_sigma, noise)[0]
 
@@ -108,7 +118,27 @@ class SAC:
     ) -> tuple[Float[Array, ""], Metrics]:
         """The four losses of soft actor-critic, summed; and what to log."""
         noise = jax.random.normal(key, batch.action.shape)
-        return loss(controller, batch, noise, self.gamma, self.actor_regulariser, self.target_entropy)
+        return loss(controller, batch, noise, self.actor_regulariser, self.target_entropy)
+
+    def transitions(
+        self,
+        windows: Window,
+        belief: Float[Array, "time batch belief"],
+        next_belief: Float[Array, "time batch belief"] | None = None,
+        actor_input: Float[Array, "time batch actor_input"] | None = None,
+    ) -> Batch:
+        """The transitions of windows after the burn-in, with returns of `n_step` steps; leaves (length, batch, ...).
+
+        Args:
+            windows: as the replay returns them.
+            belief: at the length + 1 moments after the burn-in.
+            next_belief: what V̄ reads at these moments; None: `belief`.
+            actor_input: what the actor reads there; None: `belief`.
+        """
+        burn_in = self.window.burn_in
+        after = belief if next_belief is None else next_belief
+        step, valid = windows.between(burn_in, None).step, transitions(windows, burn_in)
+        return transition_batch(step, valid, belief, after, self.n_step, self.gamma, actor_input)
 
     def learn_controller(
         self, controller: Controller, state: OptimiserState, batch: Batch, key: Key[Array, ""]
@@ -119,26 +149,20 @@ class SAC:
         return controller, state, metrics
 
 
-def standardise_beliefs(scale: Scale | None, batch: Batch) -> tuple[Scale | None, Batch]:
+def standardise_beliefs(scale: RunningStatistics | None, batch: Batch) -> tuple[RunningStatistics | None, Batch]:
     """The scale after a batch (or those of a cycle), and the batch standardised by it; without a scale, as it is."""
     if scale is None:
         return None, batch
-    scale = observe(scale, batch.belief, batch.valid)
-    belief, next_belief = standardised(scale, batch.belief), standardised(scale, batch.next_belief)
+    scale = update_statistics(scale, batch.belief, batch.valid)
+    belief, next_belief = standardise(scale, batch.belief), standardise(scale, batch.next_belief)
     return scale, batch._replace(belief=belief, next_belief=next_belief)
 
 
 def for_each_update(windows: Any, count: int) -> Any:
-    """(update · count, ...) to (update, count, ...): a cycle's windows, or what is made of them, for each update."""
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, count, *leaf.shape[1:]), windows)
+    """A cycle's windows for each of its updates: (time, update · count, ...) to (update, time, count, ...)."""
+    return jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0], -1, count, *leaf.shape[2:]).swapaxes(0, 1), windows)
 
 
-def split_updates(moments: Any, windows: int) -> Any:
-    """(time, update · windows, ...) to (update, time · windows, ...): a cycle's moments for each of its updates."""
-
-    def split(leaf: Array) -> Array:
-        time, both, *rest = leaf.shape
-        leaf = leaf.reshape(time, both // windows, windows, *rest).swapaxes(0, 1)
-        return leaf.reshape(both // windows, time * windows, *rest)
-
-    return jax.tree.map(split, moments)
+def split_updates(batch: Any, count: int) -> Any:
+    """A cycle's transitions for each of its updates: (time, update · count, ...) to (update, time · count, ...)."""
+    return jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0], -1, *leaf.shape[3:]), for_each_update(batch, count))
