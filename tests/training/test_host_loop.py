@@ -87,10 +87,10 @@ def test_every_window_is_unbroken_in_time():
     seeds, told = program.learn(seeds, 10, 20)
     assert np.all(told.metrics["valid"] > 0)
     assert not np.any(told.metrics["broken"])
-    np.testing.assert_allclose(told.episodes.total[told.episodes.done], 28.0)
+    np.testing.assert_allclose(told.episodes.episode_return[told.episodes.done], 28.0)
     assert np.all(told.episodes.success[told.episodes.done])
     result = program.evaluate(seeds.state, seeds.key)
-    np.testing.assert_allclose(result.total, np.full((2, 2, 3), 28.0))
+    np.testing.assert_allclose(result.episode_return, np.full((2, 2, 3), 28.0))
     assert result.done.all()
     program.close()
 

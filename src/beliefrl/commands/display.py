@@ -37,9 +37,9 @@ class TrainingDisplay:
     def __init__(self, console: Console, steps: int):
         """`steps` of each seed in all."""
         self.console, self.steps = console, steps
-        columns = (TextColumn("{task.description:<26}"), BarColumn(), TextColumn("{task.fields[told]}"))
+        columns = (TextColumn("{task.description:<26}"), BarColumn(), TextColumn("{task.fields[status]}"))
         self.progress = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
-        self.bar = self.progress.add_task("starting", total=steps, told="")
+        self.bar = self.progress.add_task("starting", total=steps, status="")
         self.returns = ""
         self.phase = ""
         self.began = self.phase_began = time.monotonic()
@@ -61,16 +61,18 @@ class TrainingDisplay:
         if event.doing not in ("evaluating", self.phase):
             self._begin_phase(event, now)
         if event.episodes is not None and np.any(event.episodes.done):
-            ended = np.asarray(event.episodes.total)[np.asarray(event.episodes.done)]
+            ended = np.asarray(event.episodes.episode_return)[np.asarray(event.episodes.done)]
             self.returns = f"last returns {ended.mean():.1f}"
         if event.part:
             done, of = event.part
             left = (now - self.phase_began) / done * (of - done)
-            told = f"{done:,}/{of:,} updates, {duration(left)} left in this phase"
-            self.progress.update(self.bar, completed=done, total=of, description=event.doing, told=told)
+            status = f"{done:,}/{of:,} updates, {duration(left)} left in this phase"
+            self.progress.update(self.bar, completed=done, total=of, description=event.doing, status=status)
         else:
-            told = f"step {event.step:,}/{self.steps:,}  {self._speed(event, now)}  {self.returns}"
-            self.progress.update(self.bar, completed=event.step, total=self.steps, description=event.doing, told=told)
+            status = f"step {event.step:,}/{self.steps:,}  {self._speed(event, now)}  {self.returns}"
+            self.progress.update(
+                self.bar, completed=event.step, total=self.steps, description=event.doing, status=status
+            )
         if event.evaluation is not None:
             self._evaluated(event, now)
 
@@ -90,8 +92,8 @@ class TrainingDisplay:
     def _evaluated(self, event: Event, now: float) -> None:
         result = event.evaluation
         assert result is not None
-        total, success = np.asarray(result.total), np.asarray(result.success)
-        sampled, mode = np.nanmean(total, axis=(0, 2))  # without seeds that have diverged
+        returns, success = np.asarray(result.episode_return), np.asarray(result.success)
+        sampled, mode = np.nanmean(returns, axis=(0, 2))  # diverged seeds are NaN
         means = f"return {sampled:.1f} sampled, {mode:.1f} mode"
         line = f"step {event.step:,}: {means}"
         if success.any():
@@ -166,8 +168,8 @@ class SweepDisplay:
         return Group(table, f"[{duration(time.monotonic() - self.began)}] {self._summary(status)}".replace("[", "\\["))
 
     def _line(self, line: str) -> None:
-        told = f"[{duration(time.monotonic() - self.began)}] {line}"
-        self.console.print(told, markup=False, highlight=False, soft_wrap=True)
+        stamped = f"[{duration(time.monotonic() - self.began)}] {line}"
+        self.console.print(stamped, markup=False, highlight=False, soft_wrap=True)
 
 
 def results_table(results: dict[str, Any], seeds: list[int], title: str) -> Table:

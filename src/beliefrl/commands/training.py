@@ -98,8 +98,8 @@ def _ended(run: Any) -> None:
     console, results = Console(), run.results() or {}
     title = f"{run.config['agent']} on {run.config['task']} after {results['step']:,} steps"
     console.print(results_table(results, run.seeds, title))
-    told = f"saved in {run.folder}: see curve.png; `beliefrl evaluate {run.folder}` plays more episodes"
-    console.print(told, markup=False, highlight=False, soft_wrap=True)
+    line = f"saved in {run.folder}: see curve.png; `beliefrl evaluate {run.folder}` plays more episodes"
+    console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def _same_training(run: Any, agent: str, task: dict[str, Any], options: Any) -> None:

@@ -6,7 +6,8 @@ An array is named by its place in the tree. Random keys are kept as their number
 import contextlib
 import os
 import pathlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -32,8 +33,8 @@ def packed(arrays: dict[str, np.ndarray], about: dict[str, str] | None = None) -
     return safetensors.numpy.save(arrays, about)
 
 
-def read(path: pathlib.Path, like: Any) -> Any:
-    """A tree of the structure, shapes and types of `like`.
+def read(path: pathlib.Path, like: Any, renamed: Mapping[str, str] = MappingProxyType({})) -> Any:
+    """A tree of the structure, shapes and types of `like`; `renamed` has the old names of arrays in older files.
 
     Raises:
         Damaged: it cannot be read.
@@ -43,11 +44,16 @@ def read(path: pathlib.Path, like: Any) -> Any:
     leaves = []
     for name, leaf in _named(like):
         numbers = jax.eval_shape(_numbers, leaf)
-        found = saved.get(name)
+        found = saved.get(name, saved.get(renamed.get(name, "")))
         if found is None or found.shape != numbers.shape or found.dtype != numbers.dtype:
-            raise UserError(f"{path} does not fit the agent in config.json (at {name}): they are not of one training.")
+            raise misfit(path, name)
         leaves.append(jax.random.wrap_key_data(jnp.asarray(found)) if _is_key(leaf) else found)
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
+
+
+def misfit(path: pathlib.Path, name: str) -> UserError:
+    """The error that an array of a file is missing, or of another shape or type."""
+    return UserError(f"{path} does not fit the agent in config.json (at {name}): they are not of one training.")
 
 
 def load(path: pathlib.Path) -> dict[str, np.ndarray]:

@@ -3,8 +3,8 @@
     checkpoints/
       000004-step-12000/     appears by one rename, when everything it names is on the disk
         manifest.json        {"content": {"format", "step", "progress", "files", "replay"}, "sha256": of the content}
-        state.safetensors    every array of the training but the replay's moments
-      replay/000003.safetensors   the moments that were added between two checkpoints; later checkpoints name it too
+        state.safetensors    every array of the training but the replay's timesteps
+      replay/000003.safetensors   the timesteps that were added between two checkpoints; later checkpoints name it too
 
 A replay only grows at its end, so a checkpoint writes what is new in it, and its cost does not grow with the replay. Of
 each file the manifest has size and SHA-256, so a checkpoint that is cut short or changed on the disk is known, and the
@@ -17,7 +17,9 @@ import os
 import pathlib
 import re
 import shutil
+from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
@@ -37,12 +39,12 @@ class Found(NamedTuple):
     step: int
     progress: dict[str, Any]
     tree: Any
-    moments: Any  # numpy, leaves (seed, capacity, ...)
+    timesteps: Any  # numpy, leaves (seed, capacity, ...)
     passed_over: list[str]  # what is wrong with newer ones, a sentence each
 
 
 class Segment(NamedTuple):
-    """A file with moments of every seed: those numbered from `start` to `stop`, counted from the first ever added."""
+    """A file with timesteps of every seed: those numbered from `start` to `stop`, counted from the first ever added."""
 
     file: str
     start: list[int]
@@ -61,25 +63,25 @@ class Checkpoints:
         self._thread = ThreadPoolExecutor(1, "checkpoint")
         self._writing: Future[None] | None = None
 
-    def save(self, step: int, progress: dict[str, Any], tree: Any, moments: Any, added: np.ndarray) -> None:
+    def save(self, step: int, progress: dict[str, Any], tree: Any, timesteps: Any, added: np.ndarray) -> None:
         """Copy everything, and begin to write it.
 
         Args:
             step: by which the checkpoint is known.
             progress: what else is needed to go on, as JSON has it.
-            tree: all arrays but the moments.
-            moments: leaves (seed, capacity, ...): a ring, whose last `added` were written in turn.
-            added: (seed,), moments ever added.
+            tree: all arrays but the timesteps.
+            timesteps: leaves (seed, capacity, ...): a ring, whose last `added` were written in turn.
+            added: (seed,), timesteps ever added.
 
         Raises:
             UserError: the checkpoint before this one could not be written.
         """
         self.wait()
-        state, new = arrays.copied(tree), self._new_moments(moments, added)
+        state, new = arrays.copied(tree), self._new_timesteps(timesteps, added)
         self._writing = self._thread.submit(self._write, step, progress, state, new)
 
-    def forget_moments(self) -> None:
-        """The moments written so far have changed: the next checkpoint writes all of them anew."""
+    def forget_timesteps(self) -> None:
+        """The timesteps written so far have changed: the next checkpoint writes all of them anew."""
         self.wait()
         self._segments = []
 
@@ -132,23 +134,23 @@ class Checkpoints:
 
     # Writing
 
-    def _new_moments(self, moments: Any, added: np.ndarray) -> tuple[list[int], list[int], dict[str, np.ndarray]]:
-        """The moments that no file has yet; those of seeds with fewer new ones than others are padded."""
-        capacity = jax.tree.leaves(moments)[0].shape[1]
+    def _new_timesteps(self, timesteps: Any, added: np.ndarray) -> tuple[list[int], list[int], dict[str, np.ndarray]]:
+        """The timesteps that no file has yet; those of seeds with fewer new ones than others are padded."""
+        capacity = jax.tree.leaves(timesteps)[0].shape[1]
         stop = [int(number) for number in added]
         written = self._segments[-1].stop if self._segments else [0] * len(stop)
         start = [max(old, new - capacity) for old, new in zip(written, stop, strict=True)]
         longest = max(new - old for old, new in zip(start, stop, strict=True))
         index = (np.array(start)[:, None] + np.arange(longest)) % capacity
         seed = np.arange(len(stop))[:, None]
-        return start, stop, arrays.copied(jax.tree.map(lambda leaf: _on_host(leaf)[seed, index], moments))
+        return start, stop, arrays.copied(jax.tree.map(lambda leaf: _on_host(leaf)[seed, index], timesteps))
 
     def _write(self, step: int, progress: dict[str, Any], state: dict[str, np.ndarray], new: Any) -> None:
-        start, stop, moments = new
+        start, stop, timesteps = new
         replay = self.folder / "replay"
         replay.mkdir(parents=True, exist_ok=True)
         if stop != (self._segments[-1].stop if self._segments else None):
-            path, content = replay / f"{_next_number(replay):06d}.safetensors", arrays.packed(moments)
+            path, content = replay / f"{_next_number(replay):06d}.safetensors", arrays.packed(timesteps)
             write_whole(path, content)
             self._segments.append(Segment(path.name, start, stop, len(content), _sha256(content)))
         final = self.folder / f"{_next_number(self.folder):06d}-step-{step}"
@@ -167,7 +169,7 @@ class Checkpoints:
         self._prune()
 
     def _prune(self) -> None:
-        """Remove all but the last, and the moments that none of these names."""
+        """Remove all but the last, and the timesteps that none of these names."""
         kept = self._listed()[: self.keep]
         for path in self._listed()[self.keep :]:
             shutil.rmtree(path)
@@ -183,12 +185,13 @@ class Checkpoints:
         """The newest first."""
         return sorted(listed(self.folder.parent), reverse=True)
 
-    def restore(self, like: Any, moments: Any) -> Found:
-        """The newest checkpoint that is as it was written; the next one goes on from it.
+    def restore(self, like: Any, timesteps: Any, renamed: Mapping[str, str] = MappingProxyType({})) -> Found:
+        """The newest undamaged checkpoint; the next `save` goes on from it.
 
         Args:
             like: a tree of the structure, shapes and types of what was saved.
-            moments: the same of the ring, whose capacity may have changed.
+            timesteps: the same of the ring, whose capacity may have changed.
+            renamed: the old names of arrays in checkpoints of older versions, by their present names.
 
         Raises:
             UserError: there is none that is good, or it is of another training or version.
@@ -201,9 +204,9 @@ class Checkpoints:
                 passed_over.append(str(error))
                 path.rename(path.with_name(f"damaged-{path.name}"))
                 continue
-            tree = arrays.read(path / "state.safetensors", like)
+            tree = arrays.read(path / "state.safetensors", like, renamed)
             self._segments = [Segment(**segment) for segment in content["replay"]]
-            rings = self._moments(moments, self._segments)
+            rings = self._timesteps(timesteps, self._segments)
             return Found(content["step"], content["progress"], tree, rings, passed_over)
         why = f": {passed_over[0]}" if passed_over else "."
         raise UserError(f"{self.folder.parent} has no checkpoint to go on from{why}")
@@ -222,14 +225,17 @@ class Checkpoints:
             _check(self.folder / "replay" / segment["file"], segment["size"], segment["sha256"])
         return content
 
-    def _moments(self, like: Any, segments: list[Segment]) -> Any:
+    def _timesteps(self, like: Any, segments: list[Segment]) -> Any:
         rings = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), like)
         for segment in segments:
-            saved = arrays.load(self.folder / "replay" / segment.file)
+            path = self.folder / "replay" / segment.file
+            saved = arrays.load(path)
             for where, ring in jax.tree_util.tree_leaves_with_path(rings):
+                name = jax.tree_util.keystr(where)
+                if name not in saved or saved[name].shape[2:] != ring.shape[2:]:
+                    raise arrays.misfit(path, name)
                 for seed, (start, stop) in enumerate(zip(segment.start, segment.stop, strict=True)):
-                    moments = saved[jax.tree_util.keystr(where)][seed, : stop - start]
-                    ring[seed, np.arange(start, stop) % ring.shape[1]] = moments
+                    ring[seed, np.arange(start, stop) % ring.shape[1]] = saved[name][seed, : stop - start]
         return rings
 
 

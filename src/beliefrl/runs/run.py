@@ -211,12 +211,12 @@ class Recorder(Run):
         for seed in self.seeds:
             whole = [tracker for tracker in self._trackers[seed] if tracker.is_whole]
             for row in self.rows(seed) if whole else ():
-                _tell(whole, row["kind"], row["step"], row)
+                _track(whole, row["kind"], row["step"], row)
 
     def log(self, seed: int, kind: str, step: int, values: Row) -> None:
         """Write one entry of a seed; numbers go to its trackers as well, of lists their mean."""
         self._lines[seed].write(json.dumps({"step": step, "kind": kind, **values}) + "\n")
-        _tell(self._trackers[seed], kind, step, values)
+        _track(self._trackers[seed], kind, step, values)
 
     def flush(self) -> None:
         """Bring everything logged so far onto the disk."""
@@ -244,11 +244,11 @@ class Recorder(Run):
                 stack.callback(writer.close)
 
 
-def _tell(told: list[Tracker], kind: str, step: int, values: Row) -> None:
+def _track(trackers: list[Tracker], kind: str, step: int, values: Row) -> None:
     numbers = {
         f"{kind}/{name}": float(np.mean(value))
         for name, value in values.items()
         if name not in ("step", "kind") and isinstance(value, int | float | list)
     }
-    for tracker in told:
+    for tracker in trackers:
         tracker.log(step, numbers)

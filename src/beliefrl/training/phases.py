@@ -44,14 +44,14 @@ class SeedState(NamedTuple):
 
 
 class Stretch(NamedTuple):
-    """What a stretch of steps tells, of one seed."""
+    """The results of a stretch of steps, of one seed."""
 
     metrics: Metrics  # means over its updates
     episodes: Episode | None  # leaves (stretch,): one entry a step, done only where an episode ended
 
 
 def begin(agent: Agent, task: Task, capacity: int, key: Key[Array, ""]) -> SeedState:
-    """A seed before its first step; `capacity` moments fit its replay."""
+    """A seed before its first step; its replay holds `capacity` timesteps."""
     key_state, key_actor, key = jax.random.split(key, 3)
     return seed_of(agent, task.spec, capacity, rollout.begin(agent, task, key_actor), key_state, key)
 
@@ -59,8 +59,8 @@ def begin(agent: Agent, task: Task, capacity: int, key: Key[Array, ""]) -> SeedS
 def seed_of(
     agent: Agent, spec: Spec, capacity: int, actor: ActorState, key_state: Key[Array, ""], key: Key[Array, ""]
 ) -> SeedState:
-    """A new agent and an empty replay for an actor at its first moment."""
-    return SeedState(agent.init(key_state, spec), actor, ring.init(rollout.moment(agent, actor), capacity), key)
+    """A new agent and an empty replay for an actor at its first timestep."""
+    return SeedState(agent.init(key_state, spec), actor, ring.init(rollout.stored(agent, actor), capacity), key)
 
 
 def _no_episodes(agent: Agent) -> Episode:
@@ -121,7 +121,7 @@ def pretrain(
 
 
 def refresh(agent: Agent, spec: Spec, seed: SeedState) -> SeedState:
-    """Perceive again, with the pre-trained networks, everything recorded so far (at most 2 moments a step)."""
+    """Perceive again, with the pre-trained networks, everything recorded so far (at most 2 timesteps a step)."""
     length = min(2 * agent.step_start_rl, ring.capacity(seed.replay))
     key = jax.random.fold_in(seed.key, REFRESH)
     actor, replay = rollout.refresh(agent, spec, seed.state, seed.actor, seed.replay, key, length)
@@ -148,7 +148,7 @@ def _cycle(
 ) -> tuple[SeedState, Episode, Metrics]:
     """One cycle, from environment step `first` on, whose entries in the log begin at `index`.
 
-    Its moments are added before any are drawn, and in a loop whose length XLA does not know (it would inline one of a
+    Its timesteps are added before any are drawn, and in a loop whose length XLA does not know (it would inline one of a
     single step): in either other form XLA copies the whole ring.
     """
 

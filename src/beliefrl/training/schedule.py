@@ -1,7 +1,7 @@
 """Training from the first step to the last, on the host: which phase is called when.
 
-The loop is Python over compiled stretches (`phases`); nothing is called back from inside a compiled function. `stages`
-yields what happens, `train` records it in a run's folder.
+The loop is Python over compiled stretches (`phases`); a compiled function never calls back. `stages` yields what
+happens, `train` records it in a run's folder.
 """
 
 from collections.abc import Callable, Iterator
@@ -21,7 +21,7 @@ from beliefrl.types import UserError
 
 
 class TrainingProgress(NamedTuple):
-    """How far a training is; with all its arrays, what is needed to go on."""
+    """How far a training is; with all its arrays, all that is needed to go on."""
 
     step: int = 0
     pretrained: int = 0  # updates of the pre-training
@@ -30,7 +30,7 @@ class TrainingProgress(NamedTuple):
 
 
 class Snapshot(NamedTuple):
-    """A training between two stretches; its arrays are used up when the next one begins."""
+    """A training between two stretches; the next stretch takes over the memory of its arrays."""
 
     progress: TrainingProgress
     seeds: SeedState
@@ -44,10 +44,10 @@ class Event(NamedTuple):
     metrics: Metrics = {}  # leaves (seed,): means over the last stretch
     episodes: Episode | None = None  # leaves (seed, stretch)
     evaluation: Episode | None = None  # leaves (seed, mode, episodes)
-    states: Any = None  # the agents, where they are to be saved
+    states: Any = None  # the agents, where they should be saved
     part: tuple[int, int] | None = None  # of the pre-training: updates done, of how many
-    snapshot: Snapshot | None = None  # where a training can be left, and gone on from
-    note: str | None = None  # something else that the user should know, a sentence
+    snapshot: Snapshot | None = None  # where a training can stop and be resumed
+    note: str | None = None  # another message for the user, a sentence
 
 
 def stages(
@@ -55,16 +55,16 @@ def stages(
     task: Task | GymnasiumTask,
     options: Options,
     restore: Callable[[SeedState], Snapshot] | None = None,
-    tell: Callable[[str], None] | None = None,
+    notify: Callable[[str], None] | None = None,
 ) -> Iterator[Event]:
-    """Train; yields an Event before whatever takes long and after whatever gave something to tell.
+    """Train; yields an Event before whatever takes long and after whatever has results.
 
     Args:
-        agent: what learns.
-        task: on what.
-        options: how long.
-        restore: is given the shapes of a training's arrays, and returns those to go on from.
-        tell: is called by another thread with what cannot wait for the next Event, a sentence.
+        agent: the agent to train.
+        task: the task to train it on.
+        options: how long, how often, and how it is evaluated.
+        restore: given the shapes of a training's arrays, returns the snapshot to go on from.
+        notify: called from another thread with a sentence that cannot wait for the next Event.
 
     Raises:
         Fault: of a Gymnasium environment, after an Event with what was learned until then.
@@ -73,7 +73,7 @@ def stages(
     sizes = capacity(agent, options), options.eval_episodes
     if isinstance(task, GymnasiumTask):
         yield Event("making the environments", 0)
-        program = host_loop.program(agent, task, *sizes, numbers, options.processes, tell)
+        program = host_loop.program(agent, task, *sizes, numbers, options.processes, notify)
     else:
         program = phases.compile_program(agent, task, *sizes)
     keys = jax.vmap(jax.random.key)(np.array(numbers))
@@ -87,7 +87,7 @@ def stages(
         yield from _stages(agent, program, options, *start)
     except Fault as fault:
         if fault.seeds is not None:
-            metrics, episodes = fault.told or ({}, None)
+            metrics, episodes = fault.stretch or ({}, None)
             learned = fault.seeds.state if fault.step >= agent.step_start_rl else None
             yield Event("stopped by a fault", fault.step, metrics, episodes, states=learned)
         raise
@@ -107,9 +107,9 @@ def _stages(
         yield Event("exploring", at.step)
     while at.step < explored:
         steps = min(stretch, explored - at.step, _until(at.step, options.eval_every))
-        seeds, told = program.explore(seeds, at.step, steps)
+        seeds, log = program.explore(seeds, at.step, steps)
         at = at._replace(step=at.step + steps)
-        yield Event("exploring", at.step, episodes=told.episodes)
+        yield Event("exploring", at.step, episodes=log.episodes)
         if at.step % options.eval_every == 0:
             yield from _evaluation(program, seeds, at.step, "exploring")
             at = at._replace(evaluated=at.step)
@@ -124,9 +124,9 @@ def _stages(
             updates = min(stretch, agent.pretrain_updates - at.pretrained)
             seeds, metrics = program.pretrain(seeds, at.pretrained, updates)
             at = at._replace(pretrained=at.pretrained + updates)
-            told = {f"pretrain_{name}": mean for name, mean in metrics.items()}
+            means = {f"pretrain_{name}": mean for name, mean in metrics.items()}
             part = at.pretrained, agent.pretrain_updates
-            yield Event("pre-training", at.step, told, part=part, snapshot=Snapshot(at, seeds))
+            yield Event("pre-training", at.step, means, part=part, snapshot=Snapshot(at, seeds))
         seeds, at = program.refresh(seeds), at._replace(refreshed=True)
 
     if at.step < options.steps:
@@ -136,9 +136,9 @@ def _stages(
     while at.step < options.steps:
         until = min(options.steps - at.step, _until(at.step, options.eval_every))
         cycles = min(-(-until // agent.cycle), stretch // agent.cycle)
-        seeds, told = program.learn(seeds, at.step, cycles)
+        seeds, log = program.learn(seeds, at.step, cycles)
         before, at = at.step, at._replace(step=at.step + cycles * agent.cycle)
-        yield Event("learning", at.step, told.metrics, told.episodes)
+        yield Event("learning", at.step, log.metrics, log.episodes)
         if at.step // options.eval_every > before // options.eval_every:
             yield from _evaluation(program, seeds, at.step, "learning")
             at = at._replace(evaluated=at.step)
@@ -149,7 +149,7 @@ def _stages(
 
 
 def capacity(agent: Agent, options: Options) -> int:
-    """Moments in a seed's replay: no more than can come, a moment a step and one more where an episode ends."""
+    """Timesteps in a seed's replay: no more than can come, one per step and one more where an episode ends."""
     if options.steps > agent.step_start_rl:
         needed = max(2 * agent.step_start_rl, agent.window.length + 1)  # `refresh` wants all of the exploration
         if options.replay_capacity < needed:

@@ -33,6 +33,7 @@ from beliefrl.training.stop import Requests, Stopped
 from beliefrl.types import UserError
 
 Report = Callable[[Event], None]
+RENAMED = {".actor.episode_return": ".actor.total"}  # arrays in checkpoints: the present name, the old one
 
 
 def train(
@@ -181,7 +182,7 @@ class _Training:
         """From the last good checkpoint; the log is cut back to what it was then."""
         ring = shapes.replay
         like = shapes._replace(replay=ring._replace(moments=()))
-        found = self.checkpoints.restore(like, ring.moments)
+        found = self.checkpoints.restore(like, ring.moments, RENAMED)
         for why in found.passed_over:
             self.report(Event("resuming", found.step, note=f"{why} The checkpoint before it is used."))
         self.recorder.rewind({int(seed): length for seed, length in found.progress["metrics"].items()})
@@ -189,7 +190,7 @@ class _Training:
         self.report(Event("resuming", found.step, note=f"goes on from the checkpoint of step {found.step:,}"))
         if isinstance(self.task, GymnasiumTask):
             self.report(Event("resuming", found.step, note="a new episode begins: an environment cannot be saved"))
-        seeds = found.tree._replace(replay=found.tree.replay._replace(moments=found.moments))
+        seeds = found.tree._replace(replay=found.tree.replay._replace(moments=found.timesteps))
         return Snapshot(self.last, jax.tree.map(jnp.asarray, seeds))
 
     def _listen(self, event: Event) -> None:
@@ -247,7 +248,7 @@ class _Training:
             return
         progress, asked = snapshot.progress, self.requests.number
         if progress.refreshed and not self.last.refreshed:
-            self.checkpoints.forget_moments()
+            self.checkpoints.forget_timesteps()
         self._save(snapshot)
         if asked and not self._has_ended(progress):
             self.checkpoints.wait()
