@@ -16,7 +16,7 @@ from beliefrl.runs.checkpoint import listed
 from beliefrl.runs.run import Run
 from beliefrl.sweeps.progress import Forecast
 from beliefrl.sweeps.run import SweepStatus
-from beliefrl.training.schedule import Event
+from beliefrl.training.schedule import Event, Phase
 
 
 def duration(seconds: float) -> str:
@@ -39,9 +39,9 @@ class TrainingDisplay:
         self.console, self.steps = console, steps
         columns = (TextColumn("{task.description:<26}"), BarColumn(), TextColumn("{task.fields[status]}"))
         self.progress = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
-        self.bar = self.progress.add_task("starting", total=steps, status="")
+        self.bar = self.progress.add_task(Phase.STARTING, total=steps, status="")
         self.returns = ""
-        self.phase = ""
+        self.phase = Phase.STARTING
         self.began = self.phase_began = time.monotonic()
         self.phase_step = 0
 
@@ -58,7 +58,7 @@ class TrainingDisplay:
         if event.note is not None:
             self._line(now, event.note)
             return
-        if event.doing not in ("evaluating", self.phase):
+        if event.phase not in (Phase.EVALUATING, self.phase):
             self._begin_phase(event, now)
         if event.episodes is not None and np.any(event.episodes.done):
             ended = np.asarray(event.episodes.episode_return)[np.asarray(event.episodes.done)]
@@ -67,25 +67,25 @@ class TrainingDisplay:
             done, of = event.part
             left = (now - self.phase_began) / done * (of - done)
             status = f"{done:,}/{of:,} updates, {duration(left)} left in this phase"
-            self.progress.update(self.bar, completed=done, total=of, description=event.doing, status=status)
+            self.progress.update(self.bar, completed=done, total=of, description=event.phase, status=status)
         else:
             status = f"step {event.step:,}/{self.steps:,}  {self._speed(event, now)}  {self.returns}"
             self.progress.update(
-                self.bar, completed=event.step, total=self.steps, description=event.doing, status=status
+                self.bar, completed=event.step, total=self.steps, description=event.phase, status=status
             )
         if event.evaluation is not None:
             self._evaluated(event, now)
 
     def _begin_phase(self, event: Event, now: float) -> None:
         """Say what begins; time it from after its compilation."""
-        self.phase, self.phase_began, self.phase_step = event.doing, now, event.step
+        self.phase, self.phase_began, self.phase_step = event.phase, now, event.step
         if not self.console.is_terminal:
-            self._line(now, event.doing)
+            self._line(now, event.phase)
 
     def _speed(self, event: Event, now: float) -> str:
         steps = event.step - self.phase_step
         if steps <= 0:
-            return "(a minute at most)" if event.doing.startswith("compiling") else ""
+            return "(a minute at most)" if event.phase.is_compiling else ""
         rate = steps / (now - self.phase_began)
         return f"{rate:.0f} steps/s, {duration((self.steps - event.step) / rate)} left"
 

@@ -4,6 +4,7 @@ The loop is Python over compiled stretches (`phases`); a compiled function never
 happens, `train` records it in a run's folder.
 """
 
+import enum
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -36,10 +37,39 @@ class Snapshot(NamedTuple):
     seeds: SeedState
 
 
+class Phase(enum.StrEnum):
+    """What a training does; the values are what is shown."""
+
+    STARTING = "starting"
+    RESUMING = "resuming"
+    MAKING_ENVIRONMENTS = "making the environments"
+    COMPILING_AGENT = "compiling the agent"
+    COMPILING_EXPLORATION = "compiling the exploration"
+    EXPLORING = "exploring"
+    COMPILING_PRETRAINING = "compiling the pre-training"
+    PRETRAINING = "pre-training"
+    COMPILING_LEARNING = "compiling the learning"
+    LEARNING = "learning"
+    EVALUATING = "evaluating"
+    TRAINING = "training"  # whichever of these: a note comes from another thread
+    FAULT = "stopped by a fault"
+    FINISHED = "finished"
+
+    @property
+    def is_compiling(self) -> bool:
+        """Whether nothing but a compilation happens."""
+        return self in (
+            Phase.COMPILING_AGENT,
+            Phase.COMPILING_EXPLORATION,
+            Phase.COMPILING_PRETRAINING,
+            Phase.COMPILING_LEARNING,
+        )
+
+
 class Event(NamedTuple):
     """What has just happened in a training; fields beyond the first three only where they apply."""
 
-    doing: str  # what comes next, in words
+    phase: Phase  # what comes next
     step: int  # environment steps of each seed so far
     metrics: Metrics = {}  # leaves (seed,): means over the last stretch
     episodes: Episode | None = None  # leaves (seed, stretch)
@@ -72,14 +102,14 @@ def stages(
     numbers = range(options.seed, options.seed + options.seeds)
     sizes = capacity(agent, options), options.eval_episodes
     if isinstance(task, GymnasiumTask):
-        yield Event("making the environments", 0)
+        yield Event(Phase.MAKING_ENVIRONMENTS, 0)
         program = host_loop.program(agent, task, *sizes, numbers, options.processes, notify)
     else:
         program = phases.compile_program(agent, task, *sizes)
     keys = jax.vmap(jax.random.key)(np.array(numbers))
     try:
         if restore is None:
-            yield Event("compiling the agent", 0)
+            yield Event(Phase.COMPILING_AGENT, 0)
             start = Snapshot(TrainingProgress(), program.begin(keys))
         else:
             at, seeds = restore(program.shapes(keys))
@@ -89,7 +119,7 @@ def stages(
         if fault.seeds is not None:
             metrics, episodes = fault.stretch or ({}, None)
             learned = fault.seeds.state if fault.step >= agent.step_start_rl else None
-            yield Event("stopped by a fault", fault.step, metrics, episodes, states=learned)
+            yield Event(Phase.FAULT, fault.step, metrics, episodes, states=learned)
         raise
     finally:
         program.close()
@@ -102,50 +132,50 @@ def _stages(
     stretch = phases.stretch_length(agent)
 
     if at.step < explored:
-        yield Event("compiling the exploration", at.step)
+        yield Event(Phase.COMPILING_EXPLORATION, at.step)
         seeds, _ = program.explore(seeds, at.step, 0)
-        yield Event("exploring", at.step)
+        yield Event(Phase.EXPLORING, at.step)
     while at.step < explored:
         steps = min(stretch, explored - at.step, _until(at.step, options.eval_every))
         seeds, log = program.explore(seeds, at.step, steps)
         at = at._replace(step=at.step + steps)
-        yield Event("exploring", at.step, episodes=log.episodes)
+        yield Event(Phase.EXPLORING, at.step, episodes=log.episodes)
         if at.step % options.eval_every == 0:
-            yield from _evaluation(program, seeds, at.step, "exploring")
+            yield from _evaluation(program, seeds, at.step, Phase.EXPLORING)
             at = at._replace(evaluated=at.step)
-        yield Event("exploring", at.step, snapshot=Snapshot(at, seeds))
+        yield Event(Phase.EXPLORING, at.step, snapshot=Snapshot(at, seeds))
 
     if at.step < options.steps and agent.pretrain_updates and not at.refreshed:
         if at.pretrained < agent.pretrain_updates:
-            yield Event("compiling the pre-training", at.step)
+            yield Event(Phase.COMPILING_PRETRAINING, at.step)
             seeds, _ = program.pretrain(seeds, at.pretrained, 0)
-            yield Event("pre-training", at.step)
+            yield Event(Phase.PRETRAINING, at.step)
         while at.pretrained < agent.pretrain_updates:
             updates = min(stretch, agent.pretrain_updates - at.pretrained)
             seeds, metrics = program.pretrain(seeds, at.pretrained, updates)
             at = at._replace(pretrained=at.pretrained + updates)
             means = {f"pretrain_{name}": mean for name, mean in metrics.items()}
             part = at.pretrained, agent.pretrain_updates
-            yield Event("pre-training", at.step, means, part=part, snapshot=Snapshot(at, seeds))
+            yield Event(Phase.PRETRAINING, at.step, means, part=part, snapshot=Snapshot(at, seeds))
         seeds, at = program.refresh(seeds), at._replace(refreshed=True)
 
     if at.step < options.steps:
-        yield Event("compiling the learning", at.step)
+        yield Event(Phase.COMPILING_LEARNING, at.step)
         seeds, _ = program.learn(seeds, at.step, 0)
-        yield Event("learning", at.step)
+        yield Event(Phase.LEARNING, at.step)
     while at.step < options.steps:
         until = min(options.steps - at.step, _until(at.step, options.eval_every))
         cycles = min(-(-until // agent.cycle), stretch // agent.cycle)
         seeds, log = program.learn(seeds, at.step, cycles)
         before, at = at.step, at._replace(step=at.step + cycles * agent.cycle)
-        yield Event("learning", at.step, log.metrics, log.episodes)
+        yield Event(Phase.LEARNING, at.step, log.metrics, log.episodes)
         if at.step // options.eval_every > before // options.eval_every:
-            yield from _evaluation(program, seeds, at.step, "learning")
+            yield from _evaluation(program, seeds, at.step, Phase.LEARNING)
             at = at._replace(evaluated=at.step)
-        yield Event("learning", at.step, snapshot=Snapshot(at, seeds))
+        yield Event(Phase.LEARNING, at.step, snapshot=Snapshot(at, seeds))
     if at.evaluated < at.step:
-        yield from _evaluation(program, seeds, at.step, "learning")
-        yield Event("finished", at.step, snapshot=Snapshot(at._replace(evaluated=at.step), seeds))
+        yield from _evaluation(program, seeds, at.step, Phase.LEARNING)
+        yield Event(Phase.FINISHED, at.step, snapshot=Snapshot(at._replace(evaluated=at.step), seeds))
 
 
 def capacity(agent: Agent, options: Options) -> int:
@@ -164,12 +194,12 @@ def _until(step: int, every: int) -> int:
     return every - step % every
 
 
-def _evaluation(program: Program, seeds: SeedState, step: int, doing: str) -> Iterator[Event]:
-    yield Event("evaluating", step)
+def _evaluation(program: Program, seeds: SeedState, step: int, then: Phase) -> Iterator[Event]:
+    yield Event(Phase.EVALUATING, step)
     keys = jax.vmap(lambda key: jax.random.fold_in(jax.random.fold_in(key, phases.EVALUATE), step))(seeds.key)
     try:
         result = program.evaluate(seeds.state, keys)
     except Fault as fault:
         fault.seeds, fault.step = seeds, step
         raise
-    yield Event(doing, step, evaluation=result, states=seeds.state)
+    yield Event(then, step, evaluation=result, states=seeds.state)

@@ -28,7 +28,7 @@ from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import log
 from beliefrl.training.evaluation import agent_of, task_of, tuples
 from beliefrl.training.phases import SeedState
-from beliefrl.training.schedule import Event, Options, Snapshot, TrainingProgress, capacity, stages
+from beliefrl.training.schedule import Event, Options, Phase, Snapshot, TrainingProgress, capacity, stages
 from beliefrl.training.stop import Requests, Stopped
 from beliefrl.types import UserError
 
@@ -184,12 +184,12 @@ class _Training:
         like = shapes._replace(replay=ring._replace(moments=()))
         found = self.checkpoints.restore(like, ring.moments, RENAMED)
         for why in found.passed_over:
-            self.report(Event("resuming", found.step, note=f"{why} The checkpoint before it is used."))
+            self.report(Event(Phase.RESUMING, found.step, note=f"{why} The checkpoint before it is used."))
         self.recorder.rewind({int(seed): length for seed, length in found.progress["metrics"].items()})
         self.last, self.lost = TrainingProgress(*found.progress["progress"]), set(found.progress["lost"])
-        self.report(Event("resuming", found.step, note=f"goes on from the checkpoint of step {found.step:,}"))
+        self.report(Event(Phase.RESUMING, found.step, note=f"goes on from the checkpoint of step {found.step:,}"))
         if isinstance(self.task, GymnasiumTask):
-            self.report(Event("resuming", found.step, note="a new episode begins: an environment cannot be saved"))
+            self.report(Event(Phase.RESUMING, found.step, note="a new episode begins: an environment cannot be saved"))
         seeds = found.tree._replace(replay=found.tree.replay._replace(moments=found.timesteps))
         return Snapshot(self.last, jax.tree.map(jnp.asarray, seeds))
 
@@ -205,7 +205,7 @@ class _Training:
 
     def _note(self, note: str) -> None:
         """Tell the user something at once, whichever thread it comes from."""
-        self.report(Event("training", self.step, note=note))
+        self.report(Event(Phase.TRAINING, self.step, note=note))
 
     def _look_for_divergence(self, event: Event) -> None:
         """A seed whose losses or networks are not finite any more is lost; the others go on."""
@@ -229,7 +229,7 @@ class _Training:
             note = f"seed {seed} diverged by step {event.step:,}: {why}; {where}."
             if len(self.lost) == len(self.recorder.seeds):
                 raise UserError(f"All seeds have diverged; {note} Try smaller learning rates.")
-            self.report(Event(event.doing, event.step, note=note))
+            self.report(Event(event.phase, event.step, note=note))
 
     def _is_due(self, snapshot: Snapshot) -> bool:
         """Whether it is time for a checkpoint."""
