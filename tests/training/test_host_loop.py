@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import sys
 
 import gymnasium
 import jax
@@ -10,11 +11,12 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from beliefrl import agents, evaluate, load, tasks, train
+from beliefrl import agents, cli, evaluate, load, tasks, train
 from beliefrl.runs.run import Run
 from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
 from beliefrl.tasks.pendulum import Pendulum, PendulumState
-from beliefrl.training import host_loop, phases
+from beliefrl.training import host_loop, lockstep, phases
+from beliefrl.training import train as training
 from beliefrl.training.lockstep import Lockstep
 from beliefrl.types import UserError
 from small import MODELS, SEQUENCES, SHARED, leaves, trained
@@ -164,6 +166,33 @@ def test_what_was_learned_before_a_fault_is_kept(tmp_path):
         assert [row["step"] for row in run.rows(seed, "update")][-1] == 26  # as far as it came
     action, _ = load(run, task=GymnasiumTask(Fine)).predict(np.zeros(2))
     assert np.all(np.abs(action) <= 1)
+
+
+@pytest.mark.parametrize("own_process", [False, True])
+def test_a_training_changes_only_a_process_of_its_own(monkeypatch, tmp_path, own_process):
+    """From Python it leaves the allocator alone and starts no processes, even where the command line is imported."""
+    changed = set()
+    monkeypatch.setattr(sys, "argv", ["beliefrl"])
+    monkeypatch.setattr(host_loop, "keep_memory", lambda: changed.add("allocator"))
+    monkeypatch.setattr(lockstep, "_pays", lambda task, lanes: changed.add("processes"))
+    agent = agents.make("sac-mlp", **SHARED, **SMALL["sac-mlp"])
+    train(agent, GymnasiumTask(Fine), tmp_path / "run", own_process=own_process, **few(steps=5, eval_episodes=1))
+    assert changed == ({"allocator", "processes"} if own_process else set())
+
+
+def test_the_command_line_has_a_process_of_its_own(monkeypatch, tmp_path):
+    said = []
+
+    def run(self, restore=None):
+        said.append(self.own_process)
+        self.recorder.close()
+        raise UserError("That is enough.")
+
+    monkeypatch.setattr(training._Training, "run", run)
+    for line in ("train sac-mlp pendulum-v --out", "resume"):
+        with pytest.raises(SystemExit):
+            cli.main([*line.split(), str(tmp_path / "run")])
+    assert said == [True, True]
 
 
 @pytest.mark.slow

@@ -85,7 +85,9 @@ def train(argv: Sequence[str]) -> None:
         _resume(options.out, options.training.steps)
         return
     with TrainingDisplay(console, options.training.steps) as display:
-        run = run_training(options.agent, task, options.out, display, **dataclasses.asdict(options.training))
+        run = run_training(
+            options.agent, task, options.out, display, own_process=True, **dataclasses.asdict(options.training)
+        )
     _ended(run)
 
 
@@ -129,4 +131,4 @@ def _resume(folder: pathlib.Path, steps: int | None) -> None:
 
     run = Run(folder)
     with TrainingDisplay(Console(), steps or run.options.steps) as display:
-        _ended(go_on(run, steps, report=display))
+        _ended(go_on(run, steps, report=display, own_process=True))

@@ -28,8 +28,9 @@ class Options:
     replay_capacity: int = 1_000_000
     """Most moments that a seed's replay keeps; the oldest make room."""
     processes: Processes = "auto"
-    """Gymnasium environments: a process for each (always), for none (never), or where that pays (auto, from the command
-    line). A Python script that says always must begin under `if __name__ == "__main__":`."""
+    """Gymnasium environments: a process for each (always), for none (never), or where a measurement says that it pays
+    (auto). From Python, auto is never, and a script that says always must guard its main module with `if __name__ ==
+    "__main__":`."""
     checkpoint_steps: int = 2_000
     """Environment steps between two checkpoints of everything (0: none by steps)."""
     checkpoint_minutes: float = 10.0

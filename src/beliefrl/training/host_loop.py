@@ -41,7 +41,6 @@ def program(
     notify: Callable[[str], None] | None = None,
 ) -> Program:
     """The phases of training, with an environment for each of `seeds`; `processes`, `notify`: as in `Lockstep`."""
-    _keep_memory()
     loop = HostLoop(agent, task, capacity, Lockstep(task, [f"seed {seed}" for seed in seeds], processes, notify))
     evaluation = Evaluation(agent, task, seeds, processes, notify)
 
@@ -62,8 +61,8 @@ def program(
     )
 
 
-def _keep_memory() -> None:
-    """Let the C library keep freed memory for the next call.
+def keep_memory() -> None:
+    """Let the C library keep freed memory for the next call: a setting of the whole process.
 
     A compiled function takes its scratch memory anew at every call, and where that is large the C library gives it back
     to the system each time: 10 ms of VRM's updates of a cycle were the system clearing pages again.

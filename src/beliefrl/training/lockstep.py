@@ -7,7 +7,6 @@ import contextlib
 import multiprocessing
 import os
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -50,7 +49,7 @@ class Lockstep:
         self,
         task: GymnasiumTask,
         lanes: Sequence[str],
-        processes: str = "auto",
+        processes: str = "never",
         notify: Callable[[str], None] | None = None,
     ):
         """Make an environment for each of `lanes`, the names of the environments in messages.
@@ -58,7 +57,8 @@ class Lockstep:
         Args:
             task: the task of all of them.
             lanes: for example "seed 0".
-            processes: "always" gives each a process of its own, "never" none, "auto" where that pays.
+            processes: "always" gives each a process of its own, "never" none, "auto" decides by a measurement.
+                Each process imports the main module of this one: guard it by `if __name__ == "__main__":`.
             notify: called from another thread with a sentence when making, a reset or a step takes longer than SLOW.
 
         Raises:
@@ -165,14 +165,9 @@ def _silence() -> Iterator[None]:
 
 
 def _pays(task: GymnasiumTask, lanes: int) -> bool:
-    """Whether processes of their own save more than they cost: by the time that some random steps take.
-
-    A process begins by importing the program that started it, so a script would train again in each unless it guards
-    against that; only from the command line is it sure to.
-    """
+    """Whether processes of their own save more than they cost: by the time that some random steps take."""
     cores = min(lanes, os.cpu_count() or 1)
-    by_command = os.path.basename(sys.argv[0]) in ("beliefrl", "beliefrl.exe") or "beliefrl.cli" in sys.modules
-    return by_command and cores > 1 and lanes * step_seconds(task) * (1 - 1 / cores) > HANDOVER
+    return cores > 1 and lanes * step_seconds(task) * (1 - 1 / cores) > HANDOVER
 
 
 def step_seconds(task: GymnasiumTask, steps: int = 20) -> float:

@@ -86,6 +86,7 @@ def stages(
     options: Options,
     restore: Callable[[SeedState], Snapshot] | None = None,
     notify: Callable[[str], None] | None = None,
+    own_process: bool = False,
 ) -> Iterator[Event]:
     """Train; yields an Event before whatever takes long and after whatever has results.
 
@@ -95,6 +96,7 @@ def stages(
         options: how long, how often, and how it is evaluated.
         restore: given the shapes of a training's arrays, returns the snapshot to go on from.
         notify: called from another thread with a sentence that cannot wait for the next Event.
+        own_process: as in `train`.
 
     Raises:
         Fault: of a Gymnasium environment, after an Event with what was learned until then.
@@ -103,7 +105,10 @@ def stages(
     sizes = capacity(agent, options), options.eval_episodes
     if isinstance(task, GymnasiumTask):
         yield Event(Phase.MAKING_ENVIRONMENTS, 0)
-        program = host_loop.program(agent, task, *sizes, numbers, options.processes, notify)
+        if own_process:
+            host_loop.keep_memory()
+        processes = options.processes if own_process or options.processes == "always" else "never"
+        program = host_loop.program(agent, task, *sizes, numbers, processes, notify)
     else:
         program = phases.compile_program(agent, task, *sizes)
     keys = jax.vmap(jax.random.key)(np.array(numbers))

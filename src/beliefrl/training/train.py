@@ -41,6 +41,7 @@ def train(
     task: Task | GymnasiumTask | str,
     out: str | os.PathLike[str] | None = None,
     report: Report | None = None,
+    own_process: bool = False,
     **options: Any,
 ) -> Run:
     """Train an agent on a task and record it in a folder.
@@ -51,6 +52,9 @@ def train(
         out: the run's folder; None is runs/AGENT-TASK-1, or the next free number. It must not exist, unless it is empty
             or a training left it that ended before it saved an agent or a checkpoint; then it is used again.
         report: called with every Event as it happens, for progress. Notes that cannot wait come from another thread.
+        own_process: True says that this process only trains, and that it guards its main module (`if __name__ == ...`).
+            Then processes="auto" may start processes, and training on a Gymnasium environment lets the C library keep
+            freed memory. The command line says so.
         options: the fields of `Options`: steps, seeds, seed, eval_every, eval_episodes, replay_capacity, processes,
             checkpoint_steps, checkpoint_minutes, keep_checkpoints, precision, track.
 
@@ -79,7 +83,7 @@ def train(
         **provenance(),
     }
     recorder = Recorder(out or free_folder(f"{config['agent']}-{config['task']}"), config)
-    return _Training(recorder, agent, made, chosen, report).run()
+    return _Training(recorder, agent, made, chosen, report, own_process).run()
 
 
 def resume(
@@ -87,6 +91,7 @@ def resume(
     steps: int | None = None,
     task: Task | GymnasiumTask | None = None,
     report: Report | None = None,
+    own_process: bool = False,
 ) -> Run:
     """Go on with a training from its last checkpoint.
 
@@ -98,7 +103,7 @@ def resume(
         run: a run, or its folder.
         steps: train for so many environment steps in all; None: as many as before. They may only grow.
         task: needed only where the run was trained on a task of your own.
-        report: as in `train`.
+        report, own_process: as in `train`.
 
     Raises:
         UserError: there is no such run, none of its checkpoints is good or left, another process trains it, or `steps`
@@ -119,7 +124,7 @@ def resume(
         options = dataclasses.replace(Options(**before), **({} if steps is None else {"steps": steps}))
         trackers.check(options.track)
         recorder.amend({"options": dataclasses.asdict(options)}, provenance())
-        training = _Training(recorder, agent, made, options, report)
+        training = _Training(recorder, agent, made, options, report, own_process)
         if begins_again:
             training.begin_again()
         stack.pop_all()
@@ -138,8 +143,17 @@ def _options(run: Run) -> dict[str, Any]:
 class _Training:
     """One training as it is being recorded."""
 
-    def __init__(self, recorder: Recorder, agent: Agent, task: Any, options: Options, report: Report | None):
+    def __init__(
+        self,
+        recorder: Recorder,
+        agent: Agent,
+        task: Any,
+        options: Options,
+        report: Report | None,
+        own_process: bool,
+    ):
         self.recorder, self.agent, self.task, self.options = recorder, agent, task, options
+        self.own_process = own_process
         self.report = report or (lambda event: None)
         self.has_success = task.spec.has_success
         self.checkpoints = Checkpoints(recorder.folder, options.keep_checkpoints)
@@ -166,7 +180,7 @@ class _Training:
     def _train(self, restore: Callable[[SeedState], Snapshot] | None) -> None:
         try:
             with self.checkpoints, self.requests:
-                for event in stages(self.agent, self.task, self.options, restore, self._note):
+                for event in stages(self.agent, self.task, self.options, restore, self._note, self.own_process):
                     self._listen(event)
             self.recorder.finish(self.results or {})
             draw_curve(self.recorder)
