@@ -1,4 +1,4 @@
-"""What a training shows while it runs, and the tables at the end."""
+"""The live view of a training or a sweep, and the tables at the end."""
 
 import dataclasses
 import pathlib
@@ -29,7 +29,7 @@ def duration(seconds: float) -> str:
 
 
 class TrainingDisplay:
-    """A live bar with what is being done, steps/s, time left and the last returns; a line for every evaluation.
+    """A live bar with the phase, steps/s, time left and the last returns; a line for every evaluation.
 
     Where the output is not a terminal, only the lines.
     """
@@ -77,7 +77,7 @@ class TrainingDisplay:
             self._evaluated(event, now)
 
     def _begin_phase(self, event: Event, now: float) -> None:
-        """Say what begins; time it from after its compilation."""
+        """Begin to time a phase, and print its name where there is no live bar."""
         self.phase, self.phase_began, self.phase_step = event.phase, now, event.step
         if not self.console.is_terminal:
             self._line(now, event.phase)
@@ -106,7 +106,7 @@ class TrainingDisplay:
 
 
 class SweepDisplay:
-    """What runs, what is left and when it ends, live; a line for every training that begins or ends.
+    """A live table of what runs, what is left and when it ends; a line for every training that begins or ends.
 
     Where the output is not a terminal, only the lines.
     """
@@ -193,11 +193,11 @@ def results_table(results: dict[str, Any], seeds: list[int], title: str) -> Tabl
 
 
 def run_table(run: Run, agent: Any) -> Table:
-    """What a run was made with, and how far it is."""
+    """The settings of a run, and its progress."""
     table = Table(title=Text(str(run.folder)), title_justify="left", show_header=False)
 
     def add(name: str, value: str) -> None:
-        table.add_row(name, Text(value))  # brackets in it are no markup
+        table.add_row(name, Text(value))  # without markup: it may contain brackets
 
     config = run.config
     own = {field.name: field.default for field in dataclasses.fields(agent)}
@@ -230,7 +230,7 @@ def _differs(value: Any, default: Any) -> bool:
 
 
 def scalability_table(results: dict[str, dict[str, Any]], obs: int, actions: int) -> Table:
-    """What each agent costs: the paper's scalability table (Appendix G), of this machine."""
+    """The cost of each agent: the paper's scalability table (Appendix G), measured on this machine."""
     table = Table(title=f"{obs} observations, {actions} actions", title_justify="left")
     for heading in ("agent", "ms a step", "100,000 steps", "parameters", "share of matrix peak"):
         table.add_column(heading, justify="left" if heading == "agent" else "right")

@@ -92,7 +92,7 @@ def train(argv: Sequence[str]) -> None:
 
 
 def _ended(run: Any) -> None:
-    """What a finished training is worth, and where it lies."""
+    """Print the results of a finished training, and its folder."""
     from rich.console import Console
 
     from beliefrl.commands.display import results_table
@@ -105,11 +105,11 @@ def _ended(run: Any) -> None:
 
 
 def _same_training(run: Any, agent: str, task: dict[str, Any], options: Any) -> None:
-    """Refuse to go on with a run that is of something else than the command line says."""
+    """Raise a UserError where a run was trained with other settings than the command line gives."""
     from beliefrl.types import UserError
 
     asked = {"agent": agent, **task, **dataclasses.asdict(options.training), **dataclasses.asdict(options.agent)}
-    asked = json.loads(json.dumps(asked))  # tuples, also those among the constants, are lists in the run's config
+    asked = json.loads(json.dumps(asked))  # tuples are lists in the run's config
     there = {**run.config, **run.config["options"], **run.config["hyperparameters"], "steps": options.training.steps}
     for name, value in asked.items():
         if there.get(name, value) != value:

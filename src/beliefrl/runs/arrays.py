@@ -1,6 +1,6 @@
-"""Trees of arrays as files of plain numbers (safetensors), and files that are there whole or not at all.
+"""Trees of arrays as files of plain numbers (safetensors), and files that are written atomically.
 
-An array is named by its place in the tree. Random keys are kept as their numbers. Nothing that is read can run code.
+An array is named by its place in the tree. Random keys are kept as their numbers. Reading a file runs no code.
 """
 
 import contextlib
@@ -20,7 +20,7 @@ from beliefrl.types import UserError
 
 
 class Damaged(UserError):
-    """A file is not what was written."""
+    """A file is damaged."""
 
 
 def copied(tree: Any) -> dict[str, np.ndarray]:
@@ -29,7 +29,7 @@ def copied(tree: Any) -> dict[str, np.ndarray]:
 
 
 def packed(arrays: dict[str, np.ndarray], about: dict[str, str] | None = None) -> bytes:
-    """The content of a file that holds these arrays."""
+    """The content of a safetensors file with these arrays."""
     return safetensors.numpy.save(arrays, about)
 
 
@@ -81,14 +81,14 @@ def _numbers(leaf: Any) -> Any:
 
 
 def write_whole(path: pathlib.Path, content: bytes) -> None:
-    """Write a file so that it is either the old one or the new one whole, whatever happens meanwhile."""
+    """Write a file atomically: at any time the path holds the old content or the new one."""
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(content)
 
 
 @contextlib.contextmanager
 def replacing(path: pathlib.Path) -> Iterator[pathlib.Path]:
-    """Another name to write a file under, which then takes the place of `path`; or is gone where writing failed."""
+    """A temporary name to write a file under; it then replaces `path`, or is removed if writing failed."""
     temporary = path.with_name(f".{path.name}.tmp")
     try:
         yield temporary
@@ -101,7 +101,7 @@ def replacing(path: pathlib.Path) -> Iterator[pathlib.Path]:
 
 
 def sync_folder(folder: pathlib.Path) -> None:
-    """Bring the names in a folder onto the disk."""
+    """Flush the entries of a folder to the disk."""
     if os.name != "posix":
         return
     opened = os.open(folder, os.O_RDONLY)

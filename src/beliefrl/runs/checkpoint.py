@@ -1,14 +1,14 @@
-"""Checkpoints: all of a training on the disk, whole or not at all. Knows trees of arrays, no reinforcement learning.
+"""Checkpoints: the whole state of a training, written atomically. Knows trees of arrays, no reinforcement learning.
 
     checkpoints/
-      000004-step-12000/     appears by one rename, when everything it names is on the disk
+      000004-step-12000/     appears by one rename, once all of its files are on the disk
         manifest.json        {"content": {"format", "step", "progress", "files", "replay"}, "sha256": of the content}
-        state.safetensors    every array of the training but the replay's timesteps
+        state.safetensors    every array of the training except the replay's timesteps
       replay/000003.safetensors   the timesteps that were added between two checkpoints; later checkpoints name it too
 
-A replay only grows at its end, so a checkpoint writes what is new in it, and its cost does not grow with the replay. Of
-each file the manifest has size and SHA-256, so a checkpoint that is cut short or changed on the disk is known, and the
-one before it is used. Files are plain numbers and JSON: reading them runs no code.
+A replay only grows at its end, so a checkpoint writes only what is new, and its cost does not grow with the replay. The
+manifest has the size and SHA-256 of each file: a damaged checkpoint is detected, and the one before it is used. Files
+are plain numbers and JSON: reading them runs no code.
 """
 
 import hashlib
@@ -40,11 +40,11 @@ class Found(NamedTuple):
     progress: dict[str, Any]
     tree: Any
     timesteps: Any  # numpy, leaves (seed, capacity, ...)
-    passed_over: list[str]  # what is wrong with newer ones, a sentence each
+    passed_over: list[str]  # a sentence for each newer one that is damaged
 
 
 class Segment(NamedTuple):
-    """A file with timesteps of every seed: those numbered from `start` to `stop`, counted from the first ever added."""
+    """A file with timesteps of every seed, `start` to `stop`, numbered from the first that was ever added."""
 
     file: str
     start: list[int]
@@ -54,7 +54,7 @@ class Segment(NamedTuple):
 
 
 class Checkpoints:
-    """The checkpoints of one run, written beside the training by a thread of its own."""
+    """The checkpoints of one run, written by a thread while the training goes on."""
 
     def __init__(self, folder: pathlib.Path, keep: int):
         """In `folder`/checkpoints; the last `keep` are kept."""
@@ -64,14 +64,14 @@ class Checkpoints:
         self._writing: Future[None] | None = None
 
     def save(self, step: int, progress: dict[str, Any], tree: Any, timesteps: Any, added: np.ndarray) -> None:
-        """Copy everything, and begin to write it.
+        """Copy everything, and begin to write it in the thread.
 
         Args:
-            step: by which the checkpoint is known.
-            progress: what else is needed to go on, as JSON has it.
-            tree: all arrays but the timesteps.
-            timesteps: leaves (seed, capacity, ...): a ring, whose last `added` were written in turn.
-            added: (seed,), timesteps ever added.
+            step: the environment step, part of the checkpoint's name.
+            progress: what else is needed to go on, of JSON's types.
+            tree: all arrays except the timesteps.
+            timesteps: leaves (seed, capacity, ...): a ring buffer.
+            added: (seed,), how many timesteps were ever added.
 
         Raises:
             UserError: the checkpoint before this one could not be written.
@@ -81,15 +81,15 @@ class Checkpoints:
         self._writing = self._thread.submit(self._write, step, progress, state, new)
 
     def forget_timesteps(self) -> None:
-        """The timesteps written so far have changed: the next checkpoint writes all of them anew."""
+        """Make the next checkpoint write all timesteps again, because they have changed."""
         self.wait()
         self._segments = []
 
     def wait(self) -> None:
-        """Until what was begun is written.
+        """Wait until the last `save` is written.
 
         Raises:
-            UserError: it could not be.
+            UserError: it could not be written.
         """
         writing, self._writing = self._writing, None
         if writing is None:
@@ -98,12 +98,12 @@ class Checkpoints:
             writing.result()
         except OSError as error:
             raise UserError(
-                f"The checkpoint in {self.folder} cannot be written ({error.strerror}): mend that, then "
+                f"The checkpoint in {self.folder} cannot be written ({error.strerror}): fix that, then "
                 f"`beliefrl resume {self.folder.parent}` goes on."
             ) from None
 
     def close(self) -> None:
-        """Wait, and take no more."""
+        """Wait for the last `save`, and end the thread."""
         try:
             self.wait()
         finally:
@@ -119,7 +119,7 @@ class Checkpoints:
             self.abandon()
 
     def keep_for(self, name: str) -> pathlib.Path | None:
-        """Keep the last checkpoint, whatever is written after it; returns where, or None where there is none."""
+        """Keep a copy of the last checkpoint for good; returns its folder, or None if there is no checkpoint."""
         self.wait()
         found = self._listed()
         if not found:
@@ -129,13 +129,13 @@ class Checkpoints:
         return kept
 
     def abandon(self) -> None:
-        """Take no more; what is being written is finished, what goes wrong in it concerns nobody any more."""
+        """End the thread after the last `save`; errors of that are ignored."""
         self._thread.shutdown()
 
     # Writing
 
     def _new_timesteps(self, timesteps: Any, added: np.ndarray) -> tuple[list[int], list[int], dict[str, np.ndarray]]:
-        """The timesteps that no file has yet; those of seeds with fewer new ones than others are padded."""
+        """The timesteps that are in no file yet; seeds with fewer new ones than others are padded."""
         capacity = jax.tree.leaves(timesteps)[0].shape[1]
         stop = [int(number) for number in added]
         written = self._segments[-1].stop if self._segments else [0] * len(stop)
@@ -155,7 +155,7 @@ class Checkpoints:
             self._segments.append(Segment(path.name, start, stop, len(content), _sha256(content)))
         final = self.folder / f"{_next_number(self.folder):06d}-step-{step}"
         temporary = self.folder / f".{final.name}.tmp"
-        for left in self.folder.glob(".*.tmp"):  # by a process that was killed
+        for left in self.folder.glob(".*.tmp"):  # of a process that was killed
             shutil.rmtree(left)
         temporary.mkdir()
         content = arrays.packed(state)
@@ -169,7 +169,7 @@ class Checkpoints:
         self._prune()
 
     def _prune(self) -> None:
-        """Remove all but the last, and the timesteps that none of these names."""
+        """Remove all but the last checkpoints, and files of timesteps that none of these uses."""
         kept = self._listed()[: self.keep]
         for path in self._listed()[self.keep :]:
             shutil.rmtree(path)
@@ -194,7 +194,7 @@ class Checkpoints:
             renamed: the old names of arrays in checkpoints of older versions, by their present names.
 
         Raises:
-            UserError: there is none that is good, or it is of another training or version.
+            UserError: there is no undamaged one, or it is of another training or version.
         """
         passed_over = []
         for path in self._listed():
@@ -212,7 +212,7 @@ class Checkpoints:
         raise UserError(f"{self.folder.parent} has no checkpoint to go on from{why}")
 
     def _checked(self, path: pathlib.Path) -> dict[str, Any]:
-        """The manifest, once every file that it names is as it was written."""
+        """The manifest, after every file that it names was checked."""
         content = _content(path)
         if content.get("format") != FORMAT:
             raise UserError(
@@ -240,24 +240,24 @@ class Checkpoints:
 
 
 def listed(folder: pathlib.Path) -> list[pathlib.Path]:
-    """The checkpoints in a run's folder, good or not."""
+    """The checkpoints in a run's folder, damaged or not."""
     return sorted((folder / "checkpoints").glob(f"{NUMBER}-step-*"))
 
 
 def was_ever_written(folder: pathlib.Path) -> bool:
-    """Whether a run's folder has or had a checkpoint, good or not; what a kill left of a first one does not count."""
+    """Whether a run's folder has or had a checkpoint; an incomplete first one does not count."""
     inside = (path.name for path in (folder / "checkpoints").glob("*"))
     return any(name != "replay" and not name.startswith(".") for name in inside)
 
 
 def _next_number(folder: pathlib.Path) -> int:
-    """One more than any number of a file here, so that none is ever replaced."""
+    """One more than any number of a file here, so that no file is ever replaced."""
     found = (re.search(r"\d{6}", path.name) for path in folder.iterdir())
     return max((int(number[0]) for number in found if number), default=0) + 1
 
 
 def _on_host(leaf: Any) -> Any:
-    """On a CPU JAX's own memory, which need not be copied; elsewhere what is wanted is taken out there."""
+    """On a CPU a view of JAX's memory, without a copy; on other devices the array, to be indexed there."""
     return np.asarray(leaf) if jax.default_backend() == "cpu" else leaf
 
 
@@ -274,7 +274,7 @@ def _signed(content: dict[str, Any]) -> bytes:
 
 
 def _content(path: pathlib.Path) -> dict[str, Any]:
-    """What the manifest of a checkpoint says."""
+    """The content of a checkpoint's manifest."""
     try:
         signed = json.loads((path / "manifest.json").read_bytes())
         if _sha256(_canonical(signed["content"])) == signed["sha256"]:

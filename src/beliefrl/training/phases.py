@@ -7,7 +7,7 @@
 The step counter stays outside what is mapped over seeds, and each phase is a compiled function of its own, called
 for a stretch of steps whose number is an argument: one compilation serves all stretches, and no result depends on
 how the training is cut into them. Random keys are derived from the seed's key and the running number of the step.
-`train` decides what is called when.
+`schedule` decides which phase is called when.
 """
 
 from collections.abc import Callable
@@ -35,7 +35,7 @@ def stretch_length(agent: Agent) -> int:
 
 
 class SeedState(NamedTuple):
-    """All of one training. Mapped over seeds, every leaf has a leading axis `seed`."""
+    """All arrays of one training. Mapped over seeds, every leaf has a leading axis `seed`."""
 
     state: Any  # the agent's
     actor: ActorState
@@ -164,7 +164,7 @@ def _cycle(
 
 
 def learn_cycle(agent: Agent, seed: SeedState, first: Int[Array, ""]) -> tuple[Any, Metrics]:
-    """What is learned when the steps of the cycle that began at environment step `first` are done: the new state."""
+    """Learn after the steps of the cycle that began at environment step `first`; returns the new state."""
     windows = ring.sample(seed.replay, step_key(seed.key, first, SAMPLE), agent.cycle_windows, agent.window)
     state, batches, model_metrics = agent.begin_cycle(seed.state, windows, step_key(seed.key, first, CYCLE))
 
@@ -198,11 +198,11 @@ class Program(NamedTuple):
     evaluate: Callable[..., Episode]  # states (seed, ...), keys (seed,); leaves (seed, 2, episodes)
     shapes: Callable[..., SeedState]  # keys (seed,); what `begin` gives, without its numbers
     revive: Callable[..., SeedState] = lambda seeds, step: seeds  # after they were read from a checkpoint
-    close: Callable[[], None] = lambda: None  # when no phase will be called any more
+    close: Callable[[], None] = lambda: None  # after the last phase
 
 
 def compile_program(agent: Agent, task: Task, capacity: int, episodes: int) -> Program:
-    """The phases as compiled functions. Seeds given to one are used up: their memory is taken over."""
+    """The phases as compiled functions. They donate the memory of the seeds that they are given."""
 
     def mapped(function: Callable[..., Any], numbers: int) -> Callable[..., Any]:
         return jax.jit(jax.vmap(function, in_axes=(0, *[None] * numbers)), donate_argnums=0)

@@ -1,4 +1,4 @@
-"""An agent in its task: act, step, time limit, reset, record; and evaluation. Only this file knows episodes.
+"""An agent in its task: act, step, time limit, reset, record; and evaluation. No other file knows what an episode is.
 
 What happens in one environment step, at timestep t of an episode:
 
@@ -8,7 +8,7 @@ What happens in one environment step, at timestep t of an episode:
     if it is terminal or the time limit is reached, the replay stores timestep t+1 as well and a new episode begins
 
 So every step of the loop is one step of the environment, and the current timestep is never in the replay yet.
-All functions are for one seed; `train` maps them over seeds.
+All functions are for one seed; `phases` maps them over seeds.
 """
 
 from typing import Any, NamedTuple

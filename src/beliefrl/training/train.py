@@ -1,6 +1,6 @@
-"""A training and what it leaves: its folder, log and checkpoints; how it is stopped, gone on with, and ended.
+"""Train an agent and record it: the run's folder, its log and checkpoints; stopping and resuming.
 
-`schedule.stages` does the training and yields what happens; everything here listens.
+`schedule.stages` trains and yields events; the code here records them.
 """
 
 import contextlib
@@ -51,7 +51,7 @@ def train(
         task: a task, or the name of one.
         out: the run's folder; None is runs/AGENT-TASK-1, or the next free number. It must not exist, unless it is empty
             or a training left it that ended before it saved an agent or a checkpoint; then it is used again.
-        report: called with every Event as it happens, for progress. Notes that cannot wait come from another thread.
+        report: called with every Event as it happens, to show progress. Urgent notes come from another thread.
         own_process: True says that this process only trains, and that it guards its main module (`if __name__ == ...`).
             Then processes="auto" may start processes, and training on a Gymnasium environment lets the C library keep
             freed memory. The command line says so.
@@ -63,8 +63,7 @@ def train(
 
     Raises:
         UserError: an unknown name or option, an impossible value, `out` exists, a tracker cannot be opened, the disk is
-            full, or a Gymnasium environment did what none may do; then what was learned and logged until that step is
-            saved.
+            full, or a Gymnasium environment is faulty; then what was learned and logged until that step is saved.
         Stopped: Ctrl-C or SIGTERM, once a checkpoint is written; `resume` goes on. It is a KeyboardInterrupt.
     """
     agent = agents.make(agent) if isinstance(agent, str) else agent
@@ -74,7 +73,7 @@ def train(
         if name not in known:
             raise UserError(f"Training has no option {name!r}: it has {', '.join(known)}.")
     chosen = Options(**options)
-    _ = capacity(agent, chosen), made.spec, trackers.check(chosen.track)  # complain before there is a folder
+    _ = capacity(agent, chosen), made.spec, trackers.check(chosen.track)  # raise before the folder is made
     config = {
         "agent": agents.name_of(agent),
         "hyperparameters": dataclasses.asdict(agent),  # pyright: ignore[reportArgumentType]
@@ -132,7 +131,7 @@ def resume(
 
 
 def _options(run: Run) -> dict[str, Any]:
-    """With which a run was trained."""
+    """The options that a run was trained with."""
     known = {field.name for field in dataclasses.fields(Options)}
     for name in run.config["options"]:
         if name not in known:
@@ -141,7 +140,7 @@ def _options(run: Run) -> dict[str, Any]:
 
 
 class _Training:
-    """One training as it is being recorded."""
+    """One training while it runs."""
 
     def __init__(
         self,
@@ -164,15 +163,15 @@ class _Training:
         self.requests = Requests(partial(self._note, "stopping after this stretch; Ctrl-C again ends at once"))
 
     def run(self, restore: Callable[[SeedState], Snapshot] | None = None) -> Run:
-        """To the end, or until it is stopped."""
+        """Train to the end, or until a signal."""
         try:
             with self.recorder, jax.default_matmul_precision(self.options.precision):
                 self._train(restore)
-        except BrokenPipeError:  # whoever was reading the reports has gone
+        except BrokenPipeError:  # the reader of the output has closed it
             raise
         except OSError as error:
             raise UserError(
-                f"{self.recorder.folder} cannot be written ({error.strerror}): mend that, then "
+                f"{self.recorder.folder} cannot be written ({error.strerror}): fix that, then "
                 f"`beliefrl resume {self.recorder.folder}` goes on."
             ) from None
         return self.recorder
@@ -188,12 +187,12 @@ class _Training:
             self.recorder.note_end()
 
     def begin_again(self) -> None:
-        """Forget what was logged: there is nothing to go on from."""
+        """Clear the log and begin at step 0, for want of a checkpoint."""
         self.recorder.rewind(dict.fromkeys(self.recorder.seeds, 0))
         self._note("no checkpoint was written: begins again from step 0")
 
     def restore(self, shapes: SeedState) -> Snapshot:
-        """From the last good checkpoint; the log is cut back to what it was then."""
+        """Restore the last undamaged checkpoint, and truncate the log to its length at that time."""
         ring = shapes.replay
         like = shapes._replace(replay=ring._replace(moments=()))
         found = self.checkpoints.restore(like, ring.moments, RENAMED)
@@ -218,11 +217,11 @@ class _Training:
             self._consider(event.snapshot)
 
     def _note(self, note: str) -> None:
-        """Tell the user something at once, whichever thread it comes from."""
+        """Report a note at once, from any thread."""
         self.report(Event(Phase.TRAINING, self.step, note=note))
 
     def _look_for_divergence(self, event: Event) -> None:
-        """A seed whose losses or networks are not finite any more is lost; the others go on."""
+        """Drop seeds whose losses or networks are no longer finite; the others go on."""
         for name, values in event.metrics.items():
             self._lose(np.flatnonzero(~np.isfinite(values)), event, f"{name} is not finite")
         states = event.states
@@ -246,7 +245,7 @@ class _Training:
             self.report(Event(event.phase, event.step, note=note))
 
     def _is_due(self, snapshot: Snapshot) -> bool:
-        """Whether it is time for a checkpoint."""
+        """Whether a checkpoint is due."""
         progress, options = snapshot.progress, self.options
         steps = progress.step - self.last.step >= options.checkpoint_steps > 0
         minutes = time.monotonic() - self.saved_at >= 60 * options.checkpoint_minutes > 0
@@ -257,7 +256,7 @@ class _Training:
         return progress.step >= self.options.steps and progress.evaluated == progress.step
 
     def _consider(self, snapshot: Snapshot) -> None:
-        """Write a checkpoint if it is time for one; leave if that was asked for."""
+        """Write a checkpoint if one is due; stop if a signal asked for it."""
         if not self._is_due(snapshot):
             return
         progress, asked = snapshot.progress, self.requests.number
