@@ -49,6 +49,7 @@ def main(
     rounds: int = 9,
 ) -> None:
     """Time the agents `names` with observations and actions of these sizes."""
+    host_loop.keep_memory()  # as the command line has it
     environment = GymnasiumTask(NoiseEnvironment, "noise", {"obs": obs, "actions": actions}, max_steps=1000)
     keys = jax.random.split(jax.random.key(0), seeds)
     print(f"{'agent':<10}{'compiled':>10}{'host':>10}{'ratio':>8}   ms a step, environment apart; {seeds} seeds")

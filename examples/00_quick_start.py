@@ -27,7 +27,7 @@ def main(steps: int = 15_000, seeds: int = 3, out: str = "runs/quick-start") -> 
 def tell(event: beliefrl.Event) -> None:
     """Called whenever something has happened in the training."""
     if event.evaluation is not None:
-        print(f"step {event.step}: return {event.evaluation.total[:, 0].mean():.1f}")
+        print(f"step {event.step}: return {event.evaluation.episode_return[:, 0].mean():.1f}")
 
 
 if __name__ == "__main__":

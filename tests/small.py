@@ -11,7 +11,7 @@ SEQUENCES = {"seq_len": 8, "burn_in": 4, "batch_size": 2}
 
 def trained(program, keys, cuts=(10, 10), learn=(10, 15), cycle=5):
     """Explore, pre-train, refresh and learn, in stretches of these lengths."""
-    seeds, step, told = program.begin(keys), 0, []
+    seeds, step, log = program.begin(keys), 0, []
     for steps in cuts:
         seeds, stretch = program.explore(seeds, step, steps)
         step += steps
@@ -19,9 +19,9 @@ def trained(program, keys, cuts=(10, 10), learn=(10, 15), cycle=5):
     seeds = program.refresh(seeds)
     for steps in learn:
         seeds, stretch = program.learn(seeds, step, steps // cycle)
-        told.append(jax.tree.map(np.asarray, stretch))
+        log.append(jax.tree.map(np.asarray, stretch))
         step += steps
-    return seeds, told
+    return seeds, log
 
 
 def leaves(tree):

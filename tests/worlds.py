@@ -115,6 +115,7 @@ class CountingAgent:
     pretrain_windows: int = 5
     cycle_windows: int = 8
     window: ClassVar = WindowShape(3, 6)
+    empty: ClassVar = 3.0  # the count before the first: whoever takes zeros for an empty memory counts wrongly
 
     def init(self, key, spec):
         return CountingState(jnp.zeros(()), jnp.zeros((), int))
@@ -123,14 +124,14 @@ class CountingAgent:
         return state
 
     def reset(self, spec):
-        return jnp.zeros(())
+        return jnp.array(self.empty)
 
     def act(self, state, memory, step, key, explore):
         action = jnp.where(explore, jax.random.uniform(key, (1,), minval=-1.0), 0.5)
         return action, memory + 1
 
     def note(self, memory):
-        return (memory - 1,)
+        return (memory - self.empty - 1,)
 
     def check(self, window):
         step, obs = window.step, window.step.obs[..., 0]

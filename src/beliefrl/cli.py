@@ -1,4 +1,4 @@
-"""The command line: which command, its help, and how it ends. `beliefrl --help` shows the commands."""
+"""The command line: finds the command, shows help, and turns errors into exit codes."""
 
 import difflib
 import sys
@@ -49,7 +49,7 @@ def _fail(message: str) -> NoReturn:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """The program `beliefrl`. Exits with 2 and one sentence where the user made a mistake."""
+    """The program `beliefrl`. Exits with 2 and one sentence on a UserError."""
     argv = sys.argv[1:] if argv is None else argv
     if not argv or argv[0] in ("-h", "--help", "help"):
         print(HELP, end="")
@@ -67,7 +67,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     from beliefrl.types import UserError
 
     if "" not in sys.path:
-        sys.path.insert(0, "")  # as `python -m` has it: gym:my_module:MyEnv-v0 is in the folder one is in
+        sys.path.insert(0, "")  # as `python -m` does: finds gym:my_module:MyEnv-v0 in the current folder
     try:
         COMMANDS[argv[0]](argv[1:])
     except (UsageError, UserError) as error:

@@ -1,6 +1,6 @@
 """One training of a sweep in a process of its own: `python -m beliefrl.worker [CORE] train ...`.
 
-It is the command line's `train`, on one core, and stops (with a checkpoint) if whoever started it has died.
+It runs the command line's `train` on one core, and stops (with a checkpoint) if its parent process dies.
 """
 
 import ctypes
@@ -12,7 +12,7 @@ STOP_WITH_PARENT = 1  # prctl's PR_SET_PDEATHSIG
 
 
 def main(argv: list[str]) -> None:
-    """Train on the core that is named first, or wherever the system likes where that is `-`."""
+    """Train on the core that is named first; `-` is any core."""
     parent = os.getppid()
     core, *command = argv
     if core != "-":
@@ -21,7 +21,7 @@ def main(argv: list[str]) -> None:
         ctypes.CDLL(None).prctl(STOP_WITH_PARENT, signal.SIGTERM)
         if os.getppid() != parent:
             raise SystemExit(128 + signal.SIGTERM)
-    sys.argv = ["beliefrl", *command]  # what the run's config will say
+    sys.argv = ["beliefrl", *command]  # recorded in the run's config
     from beliefrl import cli
 
     cli.main(command)

@@ -35,23 +35,23 @@ def equal(a, b):
 
 
 class Ring:
-    """A replay of two seeds whose moments are their running numbers."""
+    """A replay of two seeds whose timesteps are their running numbers."""
 
     def __init__(self):
-        self.moments = {"obs": np.zeros((SEEDS, CAPACITY, 2), np.float32), "first": np.zeros((SEEDS, CAPACITY), bool)}
+        self.timesteps = {"obs": np.zeros((SEEDS, CAPACITY, 2), np.float32), "first": np.zeros((SEEDS, CAPACITY), bool)}
         self.added = np.zeros(SEEDS, int)
 
     def add(self, *counts):
         for seed, count in enumerate(counts):
             for number in range(self.added[seed], self.added[seed] + count):
-                self.moments["obs"][seed, number % CAPACITY] = number + 100 * seed
-                self.moments["first"][seed, number % CAPACITY] = number % 3 == 0
+                self.timesteps["obs"][seed, number % CAPACITY] = number + 100 * seed
+                self.timesteps["first"][seed, number % CAPACITY] = number % 3 == 0
             self.added[seed] += count
 
 
 def saved(checkpoints, ring, step, value=None):
     value = float(step) if value is None else value
-    checkpoints.save(step, {"at": step}, tree(value), ring.moments, ring.added)
+    checkpoints.save(step, {"at": step}, tree(value), ring.timesteps, ring.added)
     checkpoints.wait()
 
 
@@ -62,13 +62,13 @@ def three(tmp_path):
     for step, counts in ((10, (3, 2)), (20, (2, 4)), (30, (0, 1))):
         ring.add(*counts)
         saved(checkpoints, ring, step)
-        rings[step] = {name: leaf.copy() for name, leaf in ring.moments.items()}
+        rings[step] = {name: leaf.copy() for name, leaf in ring.timesteps.items()}
     checkpoints.close()
     return tmp_path, rings
 
 
 def restored(folder):
-    return Checkpoints(folder, keep=3).restore(tree(), Ring().moments)
+    return Checkpoints(folder, keep=3).restore(tree(), Ring().timesteps)
 
 
 def test_everything_comes_back(three):
@@ -76,7 +76,7 @@ def test_everything_comes_back(three):
     found = restored(folder)
     assert (found.step, found.progress, found.passed_over) == (30, {"at": 30}, [])
     equal(found.tree, tree(30.0))
-    equal(found.moments, rings[30])
+    equal(found.timesteps, rings[30])
 
 
 def test_a_checkpoint_writes_only_what_is_new_in_the_replay(three):
@@ -91,25 +91,25 @@ def test_a_ring_that_has_turned_comes_back(tmp_path, counts):
     for step in range(1, 6):
         ring.add(*counts)
         saved(checkpoints, ring, step)
-        equal(restored(tmp_path).moments, ring.moments)
+        equal(restored(tmp_path).timesteps, ring.timesteps)
 
 
 def test_a_larger_ring_takes_what_a_smaller_one_held(three):
     folder, rings = three
     like = {"obs": np.zeros((SEEDS, 20, 2), np.float32), "first": np.zeros((SEEDS, 20), bool)}
     found = Checkpoints(folder, keep=3).restore(tree(), like)
-    np.testing.assert_array_equal(found.moments["obs"][0, :5], rings[30]["obs"][0, :5])
-    assert not found.moments["obs"][0, 5:].any()
+    np.testing.assert_array_equal(found.timesteps["obs"][0, :5], rings[30]["obs"][0, :5])
+    assert not found.timesteps["obs"][0, 5:].any()
 
 
 def test_moments_that_have_changed_are_written_anew(tmp_path):
     checkpoints, ring = Checkpoints(tmp_path, keep=1), Ring()
     ring.add(4, 4)
     saved(checkpoints, ring, 1)
-    ring.moments["obs"][:, :4] += 0.5
-    checkpoints.forget_moments()
+    ring.timesteps["obs"][:, :4] += 0.5
+    checkpoints.forget_timesteps()
     saved(checkpoints, ring, 2)
-    equal(restored(tmp_path).moments, ring.moments)
+    equal(restored(tmp_path).timesteps, ring.timesteps)
     assert len(list((tmp_path / "checkpoints" / "replay").iterdir())) == 1  # what nothing names is gone
 
 
@@ -119,7 +119,7 @@ def test_the_last_ones_are_kept_and_what_they_name(tmp_path):
         ring.add(1, 1)
         saved(checkpoints, ring, step)
     assert [path.name[-6:] for path in checkpoint.listed(tmp_path)] == ["step-3", "step-4"]
-    equal(restored(tmp_path).moments, ring.moments)
+    equal(restored(tmp_path).timesteps, ring.timesteps)
 
 
 def flip(path):
@@ -145,7 +145,7 @@ def test_a_damaged_checkpoint_is_passed_over_for_the_one_before(three, harm, fil
     found = restored(folder)
     assert found.step == 20
     equal(found.tree, tree(20.0))
-    equal(found.moments, rings[20])
+    equal(found.timesteps, rings[20])
     assert len(found.passed_over) == 1
     assert str(newest / file) in found.passed_over[0]
     assert newest.with_name(f"damaged-{newest.name}").exists()  # nothing is removed
@@ -157,7 +157,7 @@ def test_damaged_moments_are_known(three, harm):
     harm(sorted((folder / "checkpoints" / "replay").iterdir())[-1])
     found = restored(folder)
     assert found.step == 20
-    equal(found.moments, rings[20])
+    equal(found.timesteps, rings[20])
 
 
 def test_every_flipped_byte_is_known(three):
@@ -181,11 +181,11 @@ def test_going_on_after_damage_replaces_nothing(three):
     flip(checkpoint.listed(folder)[-1] / "state.safetensors")
     before = {path: path.read_bytes() for path in folder.rglob("*.safetensors") if "damaged" not in str(path)}
     checkpoints, ring = Checkpoints(folder, keep=3), Ring()
-    checkpoints.restore(tree(), ring.moments)
-    ring.moments, ring.added = rings[20], np.array([5, 6])
+    checkpoints.restore(tree(), ring.timesteps)
+    ring.timesteps, ring.added = rings[20], np.array([5, 6])
     ring.add(1, 1)
     saved(checkpoints, ring, 30)
-    equal(restored(folder).moments, ring.moments)
+    equal(restored(folder).timesteps, ring.timesteps)
     for path, content in before.items():
         assert not path.exists() or path.read_bytes() == content or "step-30" in str(path)
 
@@ -212,7 +212,27 @@ def test_another_version_is_refused(three):
 def test_another_agent_is_refused(three):
     folder, _ = three
     with pytest.raises(UserError, match="does not fit the agent"):
-        Checkpoints(folder, keep=3).restore(tree() | {"weights": jnp.zeros((SEEDS, 4))}, Ring().moments)
+        Checkpoints(folder, keep=3).restore(tree() | {"weights": jnp.zeros((SEEDS, 4))}, Ring().timesteps)
+
+
+@pytest.mark.parametrize(
+    "others", [{"speed": np.zeros((SEEDS, CAPACITY))}, {"obs": np.zeros((SEEDS, CAPACITY, 3), np.float32)}]
+)
+def test_a_replay_of_another_task_or_version_is_refused(three, others):
+    folder, _ = three
+    name = next(iter(others))
+    with pytest.raises(UserError, match=rf"0000\d+\.safetensors does not fit the agent .*at \['{name}'\]"):
+        Checkpoints(folder, keep=3).restore(tree(), Ring().timesteps | others)
+
+
+def test_an_array_is_found_under_its_old_name(three):
+    folder, _ = three
+    present = {"scale" if name == "weights" else name: leaf for name, leaf in tree().items()}
+    with pytest.raises(UserError, match="does not fit the agent"):
+        Checkpoints(folder, keep=3).restore(present, Ring().timesteps)
+    renamed = {"['scale']": "['weights']"}
+    found = Checkpoints(folder, keep=3).restore(present, Ring().timesteps, renamed)
+    np.testing.assert_array_equal(found.tree["scale"], tree(30.0)["weights"])
 
 
 class Planted:
@@ -239,8 +259,8 @@ def test_no_pickle_is_ever_loaded(three, monkeypatch):
 def test_a_full_disk_is_told_and_the_last_good_one_stands(three, monkeypatch, place):
     folder, rings = three
     checkpoints, ring = Checkpoints(folder, keep=3), Ring()
-    checkpoints.restore(tree(), ring.moments)
-    ring.moments, ring.added = rings[30], np.array([5, 7])
+    checkpoints.restore(tree(), ring.timesteps)
+    ring.timesteps, ring.added = rings[30], np.array([5, 7])
     ring.add(1, 1)
     real = arrays.write_whole
 
@@ -250,7 +270,7 @@ def test_a_full_disk_is_told_and_the_last_good_one_stands(three, monkeypatch, pl
         real(path, content)
 
     monkeypatch.setattr(checkpoint, "write_whole", full)
-    checkpoints.save(40, {}, tree(40.0), ring.moments, ring.added)
+    checkpoints.save(40, {}, tree(40.0), ring.timesteps, ring.added)
     with pytest.raises(UserError, match=r"cannot be written .No space left on device.: .*beliefrl resume"):
         checkpoints.wait()
     assert restored(folder).step == 30
@@ -263,7 +283,7 @@ def test_what_a_kill_leaves_behind_is_cleared_away(three):
     (left / "state.safetensors").write_bytes(b"half")
     assert restored(folder).step == 30
     checkpoints, ring = Checkpoints(folder, keep=3), Ring()
-    checkpoints.restore(tree(), ring.moments)
+    checkpoints.restore(tree(), ring.timesteps)
     saved(checkpoints, ring, 40)
     assert not left.exists()
 
@@ -276,7 +296,7 @@ def test_the_last_good_one_of_a_lost_seed_is_kept(tmp_path):
     kept = checkpoints.keep_for("seed-3")
     for step in (2, 3, 4):
         ring.add(1, 1)
-        checkpoints.forget_moments()
+        checkpoints.forget_timesteps()
         saved(checkpoints, ring, step)
     content = Checkpoints(tmp_path, keep=1)._checked(kept)
     assert content["step"] == 1

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import sys
 
 import gymnasium
 import jax
@@ -10,11 +11,12 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from beliefrl import agents, evaluate, load, tasks, train
+from beliefrl import agents, cli, evaluate, load, tasks, train
 from beliefrl.runs.run import Run
 from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
 from beliefrl.tasks.pendulum import Pendulum, PendulumState
-from beliefrl.training import host_loop, phases
+from beliefrl.training import host_loop, lockstep, phases
+from beliefrl.training import train as training
 from beliefrl.training.lockstep import Lockstep
 from beliefrl.types import UserError
 from small import MODELS, SEQUENCES, SHARED, leaves, trained
@@ -59,16 +61,16 @@ def test_the_host_loop_learns_what_the_compiled_loop_learns(name):
     agent, task = agents.make(name, **SHARED, **SMALL[name]), Hanging(max_steps=9)
     keys = jax.random.split(jax.random.key(0), 2)
     wrapped = GymnasiumTask(Wrapped, "wrapped", {"task": task})
-    there, told = trained(phases.compile_program(agent, task, 200, 2), keys, cycle=agent.cycle)
+    there, log = trained(phases.compile_program(agent, task, 200, 2), keys, cycle=agent.cycle)
     program = host_loop.program(agent, wrapped, 200, 2, range(2), "never")
-    here, told_here = trained(program, keys, cycle=agent.cycle)
+    here, log_here = trained(program, keys, cycle=agent.cycle)
     program.close()
     theirs = there._replace(actor=there.actor._replace(task_state=()))
     for ours, their in zip(leaves(here), leaves(theirs), strict=True):
         np.testing.assert_allclose(ours, their, rtol=1e-3, atol=1e-4)
-    for name, values in told[-1].metrics.items():
-        np.testing.assert_allclose(told_here[-1].metrics[name], values, rtol=1e-2, atol=1e-3)
-    for one, other in zip(told, told_here, strict=True):
+    for name, values in log[-1].metrics.items():
+        np.testing.assert_allclose(log_here[-1].metrics[name], values, rtol=1e-2, atol=1e-3)
+    for one, other in zip(log, log_here, strict=True):
         for ours, their in zip(other.episodes, one.episodes, strict=True):
             np.testing.assert_allclose(
                 np.asarray(ours)[other.episodes.done], np.asarray(their)[np.asarray(one.episodes.done)], rtol=1e-4
@@ -80,17 +82,17 @@ def test_every_window_is_unbroken_in_time():
     wrapped = GymnasiumTask(Wrapped, "counting", {"task": task}, has_success=True)
     program = host_loop.program(CountingAgent(), wrapped, 60, 3, range(2), "never")
     seeds = program.begin(jax.random.split(jax.random.key(0), 2))
-    seeds, told = program.explore(seeds, 0, 10)
-    assert told.episodes.done.sum() == 2  # of seven steps each
+    seeds, log = program.explore(seeds, 0, 10)
+    assert log.episodes.done.sum() == 2  # of seven steps each
     seeds, _ = program.pretrain(seeds, 0, 3)
     seeds = program.refresh(seeds)
-    seeds, told = program.learn(seeds, 10, 20)
-    assert np.all(told.metrics["valid"] > 0)
-    assert not np.any(told.metrics["broken"])
-    np.testing.assert_allclose(told.episodes.total[told.episodes.done], 28.0)
-    assert np.all(told.episodes.success[told.episodes.done])
+    seeds, log = program.learn(seeds, 10, 20)
+    assert np.all(log.metrics["valid"] > 0)
+    assert not np.any(log.metrics["broken"])
+    np.testing.assert_allclose(log.episodes.episode_return[log.episodes.done], 28.0)
+    assert np.all(log.episodes.success[log.episodes.done])
     result = program.evaluate(seeds.state, seeds.key)
-    np.testing.assert_allclose(result.total, np.full((2, 2, 3), 28.0))
+    np.testing.assert_allclose(result.episode_return, np.full((2, 2, 3), 28.0))
     assert result.done.all()
     program.close()
 
@@ -126,7 +128,7 @@ def test_processes_of_their_own_change_nothing_and_end(task):
         (Killed, r"robot \(step 3\): the process of seed [01] \(exit code -9\)"),
     ],
 )
-def test_a_fault_in_a_process_of_its_own_is_told_as_well(make, phrase):
+def test_a_fault_in_a_process_of_its_own_is_reported_too(make, phrase):
     lanes = Lockstep(GymnasiumTask(make, "robot"), ["seed 0", "seed 1"], "always")
     lanes.reset(np.array([0, 1]))
     with pytest.raises(Fault) as error:  # noqa: PT012
@@ -164,6 +166,33 @@ def test_what_was_learned_before_a_fault_is_kept(tmp_path):
         assert [row["step"] for row in run.rows(seed, "update")][-1] == 26  # as far as it came
     action, _ = load(run, task=GymnasiumTask(Fine)).predict(np.zeros(2))
     assert np.all(np.abs(action) <= 1)
+
+
+@pytest.mark.parametrize("own_process", [False, True])
+def test_a_training_changes_only_a_process_of_its_own(monkeypatch, tmp_path, own_process):
+    """From Python it leaves the allocator alone and starts no processes, even where the command line is imported."""
+    changed = set()
+    monkeypatch.setattr(sys, "argv", ["beliefrl"])
+    monkeypatch.setattr(host_loop, "keep_memory", lambda: changed.add("allocator"))
+    monkeypatch.setattr(lockstep, "_pays", lambda task, lanes: changed.add("processes"))
+    agent = agents.make("sac-mlp", **SHARED, **SMALL["sac-mlp"])
+    train(agent, GymnasiumTask(Fine), tmp_path / "run", own_process=own_process, **few(steps=5, eval_episodes=1))
+    assert changed == ({"allocator", "processes"} if own_process else set())
+
+
+def test_the_command_line_has_a_process_of_its_own(monkeypatch, tmp_path):
+    said = []
+
+    def run(self, restore=None):
+        said.append(self.own_process)
+        self.recorder.close()
+        raise UserError("That is enough.")
+
+    monkeypatch.setattr(training._Training, "run", run)
+    for line in ("train sac-mlp pendulum-v --out", "resume"):
+        with pytest.raises(SystemExit):
+            cli.main([*line.split(), str(tmp_path / "run")])
+    assert said == [True, True]
 
 
 @pytest.mark.slow

@@ -63,10 +63,10 @@ def test_what_is_shown_is_what_is_done(task):
     for updates in (0, 5):
         agent = agents.make("sac-mlp", **SHARED, batch_size=8, pretrain_updates=updates)
         events = stages(agent, made, Options(steps=agent.step_start_rl + 5, eval_every=1000, eval_episodes=1))
-        doing = list(dict.fromkeys(event.doing for event in events))
+        phases = list(dict.fromkeys(event.phase for event in events))
         pretraining = ["compiling the pre-training", "pre-training"] if updates else []
         begun = [*making, "compiling the agent", "compiling the exploration", "exploring", *pretraining]
-        assert doing == [*begun, "compiling the learning", "learning", "evaluating", "finished"]
+        assert phases == [*begun, "compiling the learning", "learning", "evaluating", "finished"]
 
 
 def test_the_first_step_is_taken_when_exploring_is_shown():
@@ -74,7 +74,7 @@ def test_the_first_step_is_taken_when_exploring_is_shown():
 
     def run():
         for event in stages(agents.make("sac-mlp"), GymnasiumTask(Broken), Options(steps=5)):
-            seen.append(event.doing)
+            seen.append(event.phase)
 
     with pytest.raises(UserError):
         run()

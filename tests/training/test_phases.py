@@ -143,5 +143,5 @@ def test_evaluation_leaves_training_alone_and_separates_modes():
     program = phases.compile_program(CountingAgent(), Counting(ends=4), capacity=90, episodes=3)
     keys = jax.random.split(jax.random.key(0), 2)
     result = program.evaluate(program.begin(keys).state, keys)
-    assert result.total.shape == (2, 2, 3)
-    np.testing.assert_array_equal(result.total, 10)
+    assert result.episode_return.shape == (2, 2, 3)
+    np.testing.assert_array_equal(result.episode_return, 10)

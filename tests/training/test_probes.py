@@ -95,7 +95,7 @@ def learn(task, steps, seeds=1, **hyperparameters):
     while step < steps:
         seeds, told = program.learn(seeds, step, 20)
         step += 100
-    return told.metrics, np.asarray(program.evaluate(seeds.state, keys).total)[:, 1].mean()
+    return told.metrics, np.asarray(program.evaluate(seeds.state, keys).episode_return)[:, 1].mean()
 
 
 @pytest.mark.slow

@@ -14,7 +14,8 @@ from beliefrl import agents, load, resume, train
 from beliefrl.analysis.curves import draw_curve, evaluations
 from beliefrl.cli import main
 from beliefrl.runs.arrays import load as load_arrays
-from beliefrl.runs.checkpoint import listed
+from beliefrl.runs.arrays import packed
+from beliefrl.runs.checkpoint import _sha256, _signed, listed
 from beliefrl.runs.run import Recorder, Run
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.stop import Stopped
@@ -67,6 +68,23 @@ def test_a_crashed_training_goes_on_to_the_last_bit(whole, tmp_path, share):
     assert listed(tmp_path / "run")
     resume(tmp_path / "run")
     assert files(tmp_path / "run") == files(folder)
+
+
+def test_a_checkpoint_of_an_older_version_goes_on(whole, tmp_path):
+    """It calls the return of an episode that is going on `total`."""
+    folder = tmp_path / "run"
+    with pytest.raises(Crash):
+        train(AGENT, "pendulum-v", folder, crash_at(whole[1] // 2), **OPTIONS)
+    for path in listed(folder):
+        state = load_arrays(path / "state.safetensors")
+        state[".actor.total"] = state.pop(".actor.episode_return")
+        content = packed(state)
+        (path / "state.safetensors").write_bytes(content)
+        manifest = json.loads((path / "manifest.json").read_bytes())["content"]
+        manifest["files"]["state.safetensors"] = {"size": len(content), "sha256": _sha256(content)}
+        (path / "manifest.json").write_bytes(_signed(manifest))
+    resume(folder)
+    assert files(folder) == files(whole[0])
 
 
 LINE = "train sac-mlp pendulum-v --step-start-rl 20 --pretrain-updates 150 --policy-layers 8 --value-layers 8"

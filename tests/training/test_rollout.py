@@ -11,9 +11,9 @@ AGENT = CountingAgent()
 
 
 def advanced(task, steps, key=0):
-    """The replay after some steps, as numpy, and what the steps told of episodes."""
+    """The replay after some steps, as numpy, and what the steps reported of episodes."""
     actor = rollout.begin(AGENT, task, jax.random.key(key))
-    replay = ring.init(rollout.moment(AGENT, actor), 3 * steps)
+    replay = ring.init(rollout.stored(AGENT, actor), 3 * steps)
     state = AGENT.init(jax.random.key(0), task.spec)
 
     def step(carry, key):
@@ -39,7 +39,7 @@ def test_a_terminated_episode_marks_its_last_observation_only():
     np.testing.assert_array_equal(moments.step.obs[:, 0], [*range(5)] * 3)
     np.testing.assert_array_equal(moments.step.terminated, moments.step.obs[:, 0] == 4)
     np.testing.assert_array_equal(episodes.length[episodes.done], 4)
-    np.testing.assert_array_equal(episodes.total[episodes.done], 1 + 2 + 3 + 4)
+    np.testing.assert_array_equal(episodes.episode_return[episodes.done], 1 + 2 + 3 + 4)
 
 
 def test_termination_at_the_time_limit_is_termination():
@@ -47,13 +47,13 @@ def test_termination_at_the_time_limit_is_termination():
     np.testing.assert_array_equal(moments.step.terminated, moments.step.obs[:, 0] == 7)
 
 
-def test_the_moment_in_hand_is_not_in_the_replay_yet():
+def test_the_current_timestep_is_not_in_the_replay_yet():
     moments, _, actor = advanced(Counting(), 5)
     np.testing.assert_array_equal(moments.step.obs[:, 0], range(5))
     assert float(actor.step.obs[0]) == 5
 
 
-def test_first_moments_carry_no_reward_and_no_action():
+def test_first_timesteps_carry_no_reward_and_no_action():
     moments, _, _ = advanced(Counting(), 21)
     first = moments.step.is_first
     assert not moments.step.reward[first].any()
@@ -75,7 +75,7 @@ def test_success_is_reported_where_the_episode_ends():
 @pytest.mark.parametrize("steps", [10, 14])
 def test_reliving_restores_notes_and_memory(steps):
     moments, _, actor = advanced(Counting(), steps)
-    replay = ring.init(rollout.moment(AGENT, actor), 64)
+    replay = ring.init(rollout.stored(AGENT, actor), 64)
     blank = jax.tree.map(lambda ring, new: ring.at[: new.shape[0]].set(new), replay.moments, moments)
     blank = blank._replace(note=jax.tree.map(lambda note: note * 0 - 9, blank.note))
     replay = ring.Replay(blank, jnp.array(moments.step.reward.shape[0]))
@@ -94,6 +94,6 @@ def test_evaluation_plays_whole_episodes_and_stops_counting_at_their_end():
     for task, total, length in ((Counting(), 28, 7), (Counting(ends=4), 10, 4)):
         result = jax.jit(lambda key, task=task: rollout.evaluate(AGENT, task, state, key, explore))(jax.random.key(0))
         assert result.done.all()
-        np.testing.assert_array_equal(result.total, total)
+        np.testing.assert_array_equal(result.episode_return, total)
         np.testing.assert_array_equal(result.length, length)
         np.testing.assert_array_equal(result.success, length >= 5)

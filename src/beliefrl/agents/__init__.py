@@ -61,13 +61,19 @@ class Agent(Protocol):
         ...
 
     def reset(self, spec: Spec) -> Any:
-        """The empty memory of one actor."""
+        """The empty memory of one actor: arrays, not necessarily zeros.
+
+        Whoever runs an episode gives it to `act` at the first timestep.
+        """
         ...
 
     def act(
         self, state: Any, memory: Any, step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]
     ) -> tuple[Float[Array, " action"], Any]:
-        """Perceive a moment; returns the action (a sample, or the mode where not `explore`) and the new memory."""
+        """Perceive a timestep; returns the action (a sample, or the mode where not `explore`) and the new memory.
+
+        Where `step.is_first`, `memory` is already that of `reset`: this method need not look at `is_first` for it.
+        """
         ...
 
     def note(self, memory: Any) -> Any:

@@ -1,4 +1,4 @@
-"""What a training shows while it runs, and the tables at the end."""
+"""The live view of a training or a sweep, and the tables at the end."""
 
 import dataclasses
 import pathlib
@@ -16,7 +16,7 @@ from beliefrl.runs.checkpoint import listed
 from beliefrl.runs.run import Run
 from beliefrl.sweeps.progress import Forecast
 from beliefrl.sweeps.run import SweepStatus
-from beliefrl.training.schedule import Event
+from beliefrl.training.schedule import Event, Phase
 
 
 def duration(seconds: float) -> str:
@@ -29,7 +29,7 @@ def duration(seconds: float) -> str:
 
 
 class TrainingDisplay:
-    """A live bar with what is being done, steps/s, time left and the last returns; a line for every evaluation.
+    """A live bar with the phase, steps/s, time left and the last returns; a line for every evaluation.
 
     Where the output is not a terminal, only the lines.
     """
@@ -37,11 +37,11 @@ class TrainingDisplay:
     def __init__(self, console: Console, steps: int):
         """`steps` of each seed in all."""
         self.console, self.steps = console, steps
-        columns = (TextColumn("{task.description:<26}"), BarColumn(), TextColumn("{task.fields[told]}"))
+        columns = (TextColumn("{task.description:<26}"), BarColumn(), TextColumn("{task.fields[status]}"))
         self.progress = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
-        self.bar = self.progress.add_task("starting", total=steps, told="")
+        self.bar = self.progress.add_task(Phase.STARTING, total=steps, status="")
         self.returns = ""
-        self.phase = ""
+        self.phase = Phase.STARTING
         self.began = self.phase_began = time.monotonic()
         self.phase_step = 0
 
@@ -58,40 +58,42 @@ class TrainingDisplay:
         if event.note is not None:
             self._line(now, event.note)
             return
-        if event.doing not in ("evaluating", self.phase):
+        if event.phase not in (Phase.EVALUATING, self.phase):
             self._begin_phase(event, now)
         if event.episodes is not None and np.any(event.episodes.done):
-            ended = np.asarray(event.episodes.total)[np.asarray(event.episodes.done)]
+            ended = np.asarray(event.episodes.episode_return)[np.asarray(event.episodes.done)]
             self.returns = f"last returns {ended.mean():.1f}"
         if event.part:
             done, of = event.part
             left = (now - self.phase_began) / done * (of - done)
-            told = f"{done:,}/{of:,} updates, {duration(left)} left in this phase"
-            self.progress.update(self.bar, completed=done, total=of, description=event.doing, told=told)
+            status = f"{done:,}/{of:,} updates, {duration(left)} left in this phase"
+            self.progress.update(self.bar, completed=done, total=of, description=event.phase, status=status)
         else:
-            told = f"step {event.step:,}/{self.steps:,}  {self._speed(event, now)}  {self.returns}"
-            self.progress.update(self.bar, completed=event.step, total=self.steps, description=event.doing, told=told)
+            status = f"step {event.step:,}/{self.steps:,}  {self._speed(event, now)}  {self.returns}"
+            self.progress.update(
+                self.bar, completed=event.step, total=self.steps, description=event.phase, status=status
+            )
         if event.evaluation is not None:
             self._evaluated(event, now)
 
     def _begin_phase(self, event: Event, now: float) -> None:
-        """Say what begins; time it from after its compilation."""
-        self.phase, self.phase_began, self.phase_step = event.doing, now, event.step
+        """Begin to time a phase, and print its name where there is no live bar."""
+        self.phase, self.phase_began, self.phase_step = event.phase, now, event.step
         if not self.console.is_terminal:
-            self._line(now, event.doing)
+            self._line(now, event.phase)
 
     def _speed(self, event: Event, now: float) -> str:
         steps = event.step - self.phase_step
         if steps <= 0:
-            return "(a minute at most)" if event.doing.startswith("compiling") else ""
+            return "(a minute at most)" if event.phase.is_compiling else ""
         rate = steps / (now - self.phase_began)
         return f"{rate:.0f} steps/s, {duration((self.steps - event.step) / rate)} left"
 
     def _evaluated(self, event: Event, now: float) -> None:
         result = event.evaluation
         assert result is not None
-        total, success = np.asarray(result.total), np.asarray(result.success)
-        sampled, mode = np.nanmean(total, axis=(0, 2))  # without seeds that have diverged
+        returns, success = np.asarray(result.episode_return), np.asarray(result.success)
+        sampled, mode = np.nanmean(returns, axis=(0, 2))  # diverged seeds are NaN
         means = f"return {sampled:.1f} sampled, {mode:.1f} mode"
         line = f"step {event.step:,}: {means}"
         if success.any():
@@ -104,7 +106,7 @@ class TrainingDisplay:
 
 
 class SweepDisplay:
-    """What runs, what is left and when it ends, live; a line for every training that begins or ends.
+    """A live table of what runs, what is left and when it ends; a line for every training that begins or ends.
 
     Where the output is not a terminal, only the lines.
     """
@@ -166,8 +168,8 @@ class SweepDisplay:
         return Group(table, f"[{duration(time.monotonic() - self.began)}] {self._summary(status)}".replace("[", "\\["))
 
     def _line(self, line: str) -> None:
-        told = f"[{duration(time.monotonic() - self.began)}] {line}"
-        self.console.print(told, markup=False, highlight=False, soft_wrap=True)
+        stamped = f"[{duration(time.monotonic() - self.began)}] {line}"
+        self.console.print(stamped, markup=False, highlight=False, soft_wrap=True)
 
 
 def results_table(results: dict[str, Any], seeds: list[int], title: str) -> Table:
@@ -191,11 +193,11 @@ def results_table(results: dict[str, Any], seeds: list[int], title: str) -> Tabl
 
 
 def run_table(run: Run, agent: Any) -> Table:
-    """What a run was made with, and how far it is."""
+    """The settings of a run, and its progress."""
     table = Table(title=Text(str(run.folder)), title_justify="left", show_header=False)
 
     def add(name: str, value: str) -> None:
-        table.add_row(name, Text(value))  # brackets in it are no markup
+        table.add_row(name, Text(value))  # without markup: it may contain brackets
 
     config = run.config
     own = {field.name: field.default for field in dataclasses.fields(agent)}
@@ -228,7 +230,7 @@ def _differs(value: Any, default: Any) -> bool:
 
 
 def scalability_table(results: dict[str, dict[str, Any]], obs: int, actions: int) -> Table:
-    """What each agent costs: the paper's scalability table (Appendix G), of this machine."""
+    """The cost of each agent: the paper's scalability table (Appendix G), measured on this machine."""
     table = Table(title=f"{obs} observations, {actions} actions", title_justify="left")
     for heading in ("agent", "ms a step", "100,000 steps", "parameters", "share of matrix peak"):
         table.add_column(heading, justify="left" if heading == "agent" else "right")

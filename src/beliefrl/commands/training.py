@@ -85,12 +85,14 @@ def train(argv: Sequence[str]) -> None:
         _resume(options.out, options.training.steps)
         return
     with TrainingDisplay(console, options.training.steps) as display:
-        run = run_training(options.agent, task, options.out, display, **dataclasses.asdict(options.training))
+        run = run_training(
+            options.agent, task, options.out, display, own_process=True, **dataclasses.asdict(options.training)
+        )
     _ended(run)
 
 
 def _ended(run: Any) -> None:
-    """What a finished training is worth, and where it lies."""
+    """Print the results of a finished training, and its folder."""
     from rich.console import Console
 
     from beliefrl.commands.display import results_table
@@ -98,16 +100,16 @@ def _ended(run: Any) -> None:
     console, results = Console(), run.results() or {}
     title = f"{run.config['agent']} on {run.config['task']} after {results['step']:,} steps"
     console.print(results_table(results, run.seeds, title))
-    told = f"saved in {run.folder}: see curve.png; `beliefrl evaluate {run.folder}` plays more episodes"
-    console.print(told, markup=False, highlight=False, soft_wrap=True)
+    line = f"saved in {run.folder}: see curve.png; `beliefrl evaluate {run.folder}` plays more episodes"
+    console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def _same_training(run: Any, agent: str, task: dict[str, Any], options: Any) -> None:
-    """Refuse to go on with a run that is of something else than the command line says."""
+    """Raise a UserError where a run was trained with other settings than the command line gives."""
     from beliefrl.types import UserError
 
     asked = {"agent": agent, **task, **dataclasses.asdict(options.training), **dataclasses.asdict(options.agent)}
-    asked = json.loads(json.dumps(asked))  # tuples, also those among the constants, are lists in the run's config
+    asked = json.loads(json.dumps(asked))  # tuples are lists in the run's config
     there = {**run.config, **run.config["options"], **run.config["hyperparameters"], "steps": options.training.steps}
     for name, value in asked.items():
         if there.get(name, value) != value:
@@ -129,4 +131,4 @@ def _resume(folder: pathlib.Path, steps: int | None) -> None:
 
     run = Run(folder)
     with TrainingDisplay(Console(), steps or run.options.steps) as display:
-        _ended(go_on(run, steps, report=display))
+        _ended(go_on(run, steps, report=display, own_process=True))

@@ -1,12 +1,13 @@
-"""Trees of arrays as files of plain numbers (safetensors), and files that are there whole or not at all.
+"""Trees of arrays as files of plain numbers (safetensors), and files that are written atomically.
 
-An array is named by its place in the tree. Random keys are kept as their numbers. Nothing that is read can run code.
+An array is named by its place in the tree. Random keys are kept as their numbers. Reading a file runs no code.
 """
 
 import contextlib
 import os
 import pathlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -19,7 +20,7 @@ from beliefrl.types import UserError
 
 
 class Damaged(UserError):
-    """A file is not what was written."""
+    """A file is damaged."""
 
 
 def copied(tree: Any) -> dict[str, np.ndarray]:
@@ -28,12 +29,12 @@ def copied(tree: Any) -> dict[str, np.ndarray]:
 
 
 def packed(arrays: dict[str, np.ndarray], about: dict[str, str] | None = None) -> bytes:
-    """The content of a file that holds these arrays."""
+    """The content of a safetensors file with these arrays."""
     return safetensors.numpy.save(arrays, about)
 
 
-def read(path: pathlib.Path, like: Any) -> Any:
-    """A tree of the structure, shapes and types of `like`.
+def read(path: pathlib.Path, like: Any, renamed: Mapping[str, str] = MappingProxyType({})) -> Any:
+    """A tree of the structure, shapes and types of `like`; `renamed` has the old names of arrays in older files.
 
     Raises:
         Damaged: it cannot be read.
@@ -43,11 +44,16 @@ def read(path: pathlib.Path, like: Any) -> Any:
     leaves = []
     for name, leaf in _named(like):
         numbers = jax.eval_shape(_numbers, leaf)
-        found = saved.get(name)
+        found = saved.get(name, saved.get(renamed.get(name, "")))
         if found is None or found.shape != numbers.shape or found.dtype != numbers.dtype:
-            raise UserError(f"{path} does not fit the agent in config.json (at {name}): they are not of one training.")
+            raise misfit(path, name)
         leaves.append(jax.random.wrap_key_data(jnp.asarray(found)) if _is_key(leaf) else found)
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
+
+
+def misfit(path: pathlib.Path, name: str) -> UserError:
+    """The error that an array of a file is missing, or of another shape or type."""
+    return UserError(f"{path} does not fit the agent in config.json (at {name}): they are not of one training.")
 
 
 def load(path: pathlib.Path) -> dict[str, np.ndarray]:
@@ -75,14 +81,14 @@ def _numbers(leaf: Any) -> Any:
 
 
 def write_whole(path: pathlib.Path, content: bytes) -> None:
-    """Write a file so that it is either the old one or the new one whole, whatever happens meanwhile."""
+    """Write a file atomically: at any time the path holds the old content or the new one."""
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(content)
 
 
 @contextlib.contextmanager
 def replacing(path: pathlib.Path) -> Iterator[pathlib.Path]:
-    """Another name to write a file under, which then takes the place of `path`; or is gone where writing failed."""
+    """A temporary name to write a file under; it then replaces `path`, or is removed if writing failed."""
     temporary = path.with_name(f".{path.name}.tmp")
     try:
         yield temporary
@@ -95,7 +101,7 @@ def replacing(path: pathlib.Path) -> Iterator[pathlib.Path]:
 
 
 def sync_folder(folder: pathlib.Path) -> None:
-    """Bring the names in a folder onto the disk."""
+    """Flush the entries of a folder to the disk."""
     if os.name != "posix":
         return
     opened = os.open(folder, os.O_RDONLY)

@@ -1,14 +1,14 @@
-"""Checkpoints: all of a training on the disk, whole or not at all. Knows trees of arrays, no reinforcement learning.
+"""Checkpoints: the whole state of a training, written atomically. Knows trees of arrays, no reinforcement learning.
 
     checkpoints/
-      000004-step-12000/     appears by one rename, when everything it names is on the disk
+      000004-step-12000/     appears by one rename, once all of its files are on the disk
         manifest.json        {"content": {"format", "step", "progress", "files", "replay"}, "sha256": of the content}
-        state.safetensors    every array of the training but the replay's moments
-      replay/000003.safetensors   the moments that were added between two checkpoints; later checkpoints name it too
+        state.safetensors    every array of the training except the replay's timesteps
+      replay/000003.safetensors   the timesteps that were added between two checkpoints; later checkpoints name it too
 
-A replay only grows at its end, so a checkpoint writes what is new in it, and its cost does not grow with the replay. Of
-each file the manifest has size and SHA-256, so a checkpoint that is cut short or changed on the disk is known, and the
-one before it is used. Files are plain numbers and JSON: reading them runs no code.
+A replay only grows at its end, so a checkpoint writes only what is new, and its cost does not grow with the replay. The
+manifest has the size and SHA-256 of each file: a damaged checkpoint is detected, and the one before it is used. Files
+are plain numbers and JSON: reading them runs no code.
 """
 
 import hashlib
@@ -17,7 +17,9 @@ import os
 import pathlib
 import re
 import shutil
+from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
@@ -37,12 +39,12 @@ class Found(NamedTuple):
     step: int
     progress: dict[str, Any]
     tree: Any
-    moments: Any  # numpy, leaves (seed, capacity, ...)
-    passed_over: list[str]  # what is wrong with newer ones, a sentence each
+    timesteps: Any  # numpy, leaves (seed, capacity, ...)
+    passed_over: list[str]  # a sentence for each newer one that is damaged
 
 
 class Segment(NamedTuple):
-    """A file with moments of every seed: those numbered from `start` to `stop`, counted from the first ever added."""
+    """A file with timesteps of every seed, `start` to `stop`, numbered from the first that was ever added."""
 
     file: str
     start: list[int]
@@ -52,7 +54,7 @@ class Segment(NamedTuple):
 
 
 class Checkpoints:
-    """The checkpoints of one run, written beside the training by a thread of its own."""
+    """The checkpoints of one run, written by a thread while the training goes on."""
 
     def __init__(self, folder: pathlib.Path, keep: int):
         """In `folder`/checkpoints; the last `keep` are kept."""
@@ -61,33 +63,33 @@ class Checkpoints:
         self._thread = ThreadPoolExecutor(1, "checkpoint")
         self._writing: Future[None] | None = None
 
-    def save(self, step: int, progress: dict[str, Any], tree: Any, moments: Any, added: np.ndarray) -> None:
-        """Copy everything, and begin to write it.
+    def save(self, step: int, progress: dict[str, Any], tree: Any, timesteps: Any, added: np.ndarray) -> None:
+        """Copy everything, and begin to write it in the thread.
 
         Args:
-            step: by which the checkpoint is known.
-            progress: what else is needed to go on, as JSON has it.
-            tree: all arrays but the moments.
-            moments: leaves (seed, capacity, ...): a ring, whose last `added` were written in turn.
-            added: (seed,), moments ever added.
+            step: the environment step, part of the checkpoint's name.
+            progress: what else is needed to go on, of JSON's types.
+            tree: all arrays except the timesteps.
+            timesteps: leaves (seed, capacity, ...): a ring buffer.
+            added: (seed,), how many timesteps were ever added.
 
         Raises:
             UserError: the checkpoint before this one could not be written.
         """
         self.wait()
-        state, new = arrays.copied(tree), self._new_moments(moments, added)
+        state, new = arrays.copied(tree), self._new_timesteps(timesteps, added)
         self._writing = self._thread.submit(self._write, step, progress, state, new)
 
-    def forget_moments(self) -> None:
-        """The moments written so far have changed: the next checkpoint writes all of them anew."""
+    def forget_timesteps(self) -> None:
+        """Make the next checkpoint write all timesteps again, because they have changed."""
         self.wait()
         self._segments = []
 
     def wait(self) -> None:
-        """Until what was begun is written.
+        """Wait until the last `save` is written.
 
         Raises:
-            UserError: it could not be.
+            UserError: it could not be written.
         """
         writing, self._writing = self._writing, None
         if writing is None:
@@ -96,12 +98,12 @@ class Checkpoints:
             writing.result()
         except OSError as error:
             raise UserError(
-                f"The checkpoint in {self.folder} cannot be written ({error.strerror}): mend that, then "
+                f"The checkpoint in {self.folder} cannot be written ({error.strerror}): fix that, then "
                 f"`beliefrl resume {self.folder.parent}` goes on."
             ) from None
 
     def close(self) -> None:
-        """Wait, and take no more."""
+        """Wait for the last `save`, and end the thread."""
         try:
             self.wait()
         finally:
@@ -117,7 +119,7 @@ class Checkpoints:
             self.abandon()
 
     def keep_for(self, name: str) -> pathlib.Path | None:
-        """Keep the last checkpoint, whatever is written after it; returns where, or None where there is none."""
+        """Keep a copy of the last checkpoint for good; returns its folder, or None if there is no checkpoint."""
         self.wait()
         found = self._listed()
         if not found:
@@ -127,33 +129,33 @@ class Checkpoints:
         return kept
 
     def abandon(self) -> None:
-        """Take no more; what is being written is finished, what goes wrong in it concerns nobody any more."""
+        """End the thread after the last `save`; errors of that are ignored."""
         self._thread.shutdown()
 
     # Writing
 
-    def _new_moments(self, moments: Any, added: np.ndarray) -> tuple[list[int], list[int], dict[str, np.ndarray]]:
-        """The moments that no file has yet; those of seeds with fewer new ones than others are padded."""
-        capacity = jax.tree.leaves(moments)[0].shape[1]
+    def _new_timesteps(self, timesteps: Any, added: np.ndarray) -> tuple[list[int], list[int], dict[str, np.ndarray]]:
+        """The timesteps that are in no file yet; seeds with fewer new ones than others are padded."""
+        capacity = jax.tree.leaves(timesteps)[0].shape[1]
         stop = [int(number) for number in added]
         written = self._segments[-1].stop if self._segments else [0] * len(stop)
         start = [max(old, new - capacity) for old, new in zip(written, stop, strict=True)]
         longest = max(new - old for old, new in zip(start, stop, strict=True))
         index = (np.array(start)[:, None] + np.arange(longest)) % capacity
         seed = np.arange(len(stop))[:, None]
-        return start, stop, arrays.copied(jax.tree.map(lambda leaf: _on_host(leaf)[seed, index], moments))
+        return start, stop, arrays.copied(jax.tree.map(lambda leaf: _on_host(leaf)[seed, index], timesteps))
 
     def _write(self, step: int, progress: dict[str, Any], state: dict[str, np.ndarray], new: Any) -> None:
-        start, stop, moments = new
+        start, stop, timesteps = new
         replay = self.folder / "replay"
         replay.mkdir(parents=True, exist_ok=True)
         if stop != (self._segments[-1].stop if self._segments else None):
-            path, content = replay / f"{_next_number(replay):06d}.safetensors", arrays.packed(moments)
+            path, content = replay / f"{_next_number(replay):06d}.safetensors", arrays.packed(timesteps)
             write_whole(path, content)
             self._segments.append(Segment(path.name, start, stop, len(content), _sha256(content)))
         final = self.folder / f"{_next_number(self.folder):06d}-step-{step}"
         temporary = self.folder / f".{final.name}.tmp"
-        for left in self.folder.glob(".*.tmp"):  # by a process that was killed
+        for left in self.folder.glob(".*.tmp"):  # of a process that was killed
             shutil.rmtree(left)
         temporary.mkdir()
         content = arrays.packed(state)
@@ -167,7 +169,7 @@ class Checkpoints:
         self._prune()
 
     def _prune(self) -> None:
-        """Remove all but the last, and the moments that none of these names."""
+        """Remove all but the last checkpoints, and files of timesteps that none of these uses."""
         kept = self._listed()[: self.keep]
         for path in self._listed()[self.keep :]:
             shutil.rmtree(path)
@@ -183,15 +185,16 @@ class Checkpoints:
         """The newest first."""
         return sorted(listed(self.folder.parent), reverse=True)
 
-    def restore(self, like: Any, moments: Any) -> Found:
-        """The newest checkpoint that is as it was written; the next one goes on from it.
+    def restore(self, like: Any, timesteps: Any, renamed: Mapping[str, str] = MappingProxyType({})) -> Found:
+        """The newest undamaged checkpoint; the next `save` goes on from it.
 
         Args:
             like: a tree of the structure, shapes and types of what was saved.
-            moments: the same of the ring, whose capacity may have changed.
+            timesteps: the same of the ring, whose capacity may have changed.
+            renamed: the old names of arrays in checkpoints of older versions, by their present names.
 
         Raises:
-            UserError: there is none that is good, or it is of another training or version.
+            UserError: there is no undamaged one, or it is of another training or version.
         """
         passed_over = []
         for path in self._listed():
@@ -201,15 +204,15 @@ class Checkpoints:
                 passed_over.append(str(error))
                 path.rename(path.with_name(f"damaged-{path.name}"))
                 continue
-            tree = arrays.read(path / "state.safetensors", like)
+            tree = arrays.read(path / "state.safetensors", like, renamed)
             self._segments = [Segment(**segment) for segment in content["replay"]]
-            rings = self._moments(moments, self._segments)
+            rings = self._timesteps(timesteps, self._segments)
             return Found(content["step"], content["progress"], tree, rings, passed_over)
         why = f": {passed_over[0]}" if passed_over else "."
         raise UserError(f"{self.folder.parent} has no checkpoint to go on from{why}")
 
     def _checked(self, path: pathlib.Path) -> dict[str, Any]:
-        """The manifest, once every file that it names is as it was written."""
+        """The manifest, after every file that it names was checked."""
         content = _content(path)
         if content.get("format") != FORMAT:
             raise UserError(
@@ -222,36 +225,39 @@ class Checkpoints:
             _check(self.folder / "replay" / segment["file"], segment["size"], segment["sha256"])
         return content
 
-    def _moments(self, like: Any, segments: list[Segment]) -> Any:
+    def _timesteps(self, like: Any, segments: list[Segment]) -> Any:
         rings = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), like)
         for segment in segments:
-            saved = arrays.load(self.folder / "replay" / segment.file)
+            path = self.folder / "replay" / segment.file
+            saved = arrays.load(path)
             for where, ring in jax.tree_util.tree_leaves_with_path(rings):
+                name = jax.tree_util.keystr(where)
+                if name not in saved or saved[name].shape[2:] != ring.shape[2:]:
+                    raise arrays.misfit(path, name)
                 for seed, (start, stop) in enumerate(zip(segment.start, segment.stop, strict=True)):
-                    moments = saved[jax.tree_util.keystr(where)][seed, : stop - start]
-                    ring[seed, np.arange(start, stop) % ring.shape[1]] = moments
+                    ring[seed, np.arange(start, stop) % ring.shape[1]] = saved[name][seed, : stop - start]
         return rings
 
 
 def listed(folder: pathlib.Path) -> list[pathlib.Path]:
-    """The checkpoints in a run's folder, good or not."""
+    """The checkpoints in a run's folder, damaged or not."""
     return sorted((folder / "checkpoints").glob(f"{NUMBER}-step-*"))
 
 
 def was_ever_written(folder: pathlib.Path) -> bool:
-    """Whether a run's folder has or had a checkpoint, good or not; what a kill left of a first one does not count."""
+    """Whether a run's folder has or had a checkpoint; an incomplete first one does not count."""
     inside = (path.name for path in (folder / "checkpoints").glob("*"))
     return any(name != "replay" and not name.startswith(".") for name in inside)
 
 
 def _next_number(folder: pathlib.Path) -> int:
-    """One more than any number of a file here, so that none is ever replaced."""
+    """One more than any number of a file here, so that no file is ever replaced."""
     found = (re.search(r"\d{6}", path.name) for path in folder.iterdir())
     return max((int(number[0]) for number in found if number), default=0) + 1
 
 
 def _on_host(leaf: Any) -> Any:
-    """On a CPU JAX's own memory, which need not be copied; elsewhere what is wanted is taken out there."""
+    """On a CPU a view of JAX's memory, without a copy; on other devices the array, to be indexed there."""
     return np.asarray(leaf) if jax.default_backend() == "cpu" else leaf
 
 
@@ -268,7 +274,7 @@ def _signed(content: dict[str, Any]) -> bytes:
 
 
 def _content(path: pathlib.Path) -> dict[str, Any]:
-    """What the manifest of a checkpoint says."""
+    """The content of a checkpoint's manifest."""
     try:
         signed = json.loads((path / "manifest.json").read_bytes())
         if _sha256(_canonical(signed["content"])) == signed["sha256"]:

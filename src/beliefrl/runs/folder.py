@@ -1,4 +1,4 @@
-"""The folder of a run: made, locked against other processes, and cleared where nothing in it is worth keeping."""
+"""The folder of a run: making it, locking it against other processes, and clearing it if nothing was saved."""
 
 import contextlib
 import json
@@ -12,8 +12,8 @@ from beliefrl.runs import records
 from beliefrl.runs.arrays import write_whole
 from beliefrl.types import UserError
 
-MAKING = r"metrics|lock|\.config\.json\.tmp"  # what is there before config.json is
-UNSAVED = (  # what a training writes before it has saved an agent or a checkpoint
+MAKING = r"metrics|lock|\.config\.json\.tmp"  # files that are made before config.json
+UNSAVED = (  # files of a training that has saved no agent and no checkpoint
     rf"{MAKING}|config\.json|metrics/seed-\d+\.jsonl|\.[\w.]+\.tmp|(tensorboard|wandb)(/.*)?"
     r"|checkpoints(/replay(/.*)?|/\.[^/]*\.tmp(/.*)?)?"
 )
@@ -22,7 +22,7 @@ UNSAVED = (  # what a training writes before it has saved an agent or a checkpoi
 def make(folder: pathlib.Path, config: dict[str, Any]) -> None:
     """Make the folder of a new run.
 
-    A folder is taken if it is empty, or if a training left it that saved nothing; see `clear`.
+    An existing folder is used if it is empty, or if its training saved nothing; see `clear`.
 
     Raises:
         UserError: it exists and holds something else, or it cannot be made.
@@ -37,10 +37,10 @@ def make(folder: pathlib.Path, config: dict[str, Any]) -> None:
 
 
 def clear(folder: pathlib.Path) -> None:
-    """Remove what is left of a training that failed or was killed before it saved anything; the folder itself stays.
+    """Remove the files of a training that ended before it saved anything; the folder itself stays.
 
     Raises:
-        UserError: it holds an agent, a checkpoint or anything that no training wrote; or a process writes it.
+        UserError: it holds an agent, a checkpoint or a file that no training writes; or a process is training there.
     """
     inside = [path.relative_to(folder).as_posix() for path in folder.rglob("*")]
     is_run = _is_of_training(folder)
@@ -58,15 +58,15 @@ def clear(folder: pathlib.Path) -> None:
 
 
 def write_config(folder: pathlib.Path, config: dict[str, Any]) -> None:
-    """Write config.json, whole or not at all."""
+    """Write config.json atomically."""
     write_whole(folder / "config.json", (json.dumps(config, indent=2, default=str) + "\n").encode())
 
 
 def locked(folder: pathlib.Path, doing: str) -> Any:
-    """An open file that no other process can lock; the system lets go of it when this one ends, however it ends.
+    """An open file that no other process can lock; the system unlocks it when this process ends.
 
     Raises:
-        UserError: the folder cannot be written, or another process is doing something with it.
+        UserError: the folder cannot be written, or another process has locked it.
     """
     try:
         file = (folder / "lock").open("a+")
@@ -100,7 +100,7 @@ def _is_of_training(folder: pathlib.Path) -> bool:
 
 
 def free_folder(name: str, parent: str = "runs") -> pathlib.Path:
-    """The first of runs/NAME-1, runs/NAME-2, ... that does not exist; what no file is called becomes a dash."""
+    """The first of runs/NAME-1, runs/NAME-2, ... that does not exist; special characters become dashes."""
     number, name = 1, re.sub(r"[^\w.-]+", "-", name)
     while (folder := pathlib.Path(parent) / f"{name}-{number}").exists():
         number += 1

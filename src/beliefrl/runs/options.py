@@ -6,14 +6,14 @@ from typing import Literal, get_args
 from beliefrl.runs import trackers
 from beliefrl.types import UserError, check_choice, check_range
 
-MOST_EPISODES = 100_000  # side by side
+MOST_EPISODES = 100_000  # in parallel
 Processes = Literal["auto", "always", "never"]
 Precision = Literal["float32", "tensorfloat32"]  # by their names in JAX
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """How long, how often and how a training is evaluated."""
+    """How long a training is, and how it is evaluated and saved."""
 
     steps: int = 20_000
     """Environment steps of each seed, rounded up to whole cycles of the agent."""
@@ -26,10 +26,11 @@ class Options:
     eval_episodes: int = 5
     """Episodes of each evaluation, with sampled actions and again with mode actions."""
     replay_capacity: int = 1_000_000
-    """Most moments that a seed's replay keeps; the oldest make room."""
+    """Most timesteps that a seed's replay keeps; new ones replace the oldest."""
     processes: Processes = "auto"
-    """Gymnasium environments: a process for each (always), for none (never), or where that pays (auto, from the command
-    line). A Python script that says always must begin under `if __name__ == "__main__":`."""
+    """Gymnasium environments: a process for each (always), for none (never), or where a measurement says that it pays
+    (auto). From Python, auto is never, and a script that says always must guard its main module with `if __name__ ==
+    "__main__":`."""
     checkpoint_steps: int = 2_000
     """Environment steps between two checkpoints of everything (0: none by steps)."""
     checkpoint_minutes: float = 10.0
@@ -40,8 +41,8 @@ class Options:
     """Precision of matrix products: float32, or tensorfloat32, which lets an NVIDIA GPU (Ampere or later) round their
     factors to 10 bits of mantissa to be faster. A CPU computes in float32 either way."""
     track: tuple[Literal["tensorboard", "wandb"], ...] = ("tensorboard",)
-    """Where numbers go besides the run's own logs: tensorboard, wandb (extra `wandb`; offline unless WANDB_MODE says
-    otherwise), both, or nowhere."""
+    """Trackers that get the numbers besides the run's own logs: tensorboard, wandb (extra `wandb`; offline unless
+    WANDB_MODE says otherwise), both, or none."""
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""

@@ -1,4 +1,4 @@
-"""What a run was made with: versions, machine, git commit, command line and time."""
+"""The provenance of a run: versions, machine, git commit, command line and time."""
 
 import os
 import pathlib
@@ -15,7 +15,7 @@ PACKAGES = ("beliefrl", "jax", "jaxlib", "equinox", "optax", "numpy")
 
 
 def provenance() -> dict[str, Any]:
-    """What this process is, for a run's config."""
+    """The record of this process in a run's config."""
     return {
         "versions": {"python": platform.python_version()} | {name: metadata.version(name) for name in PACKAGES},
         "device": str(jax.devices()[0].device_kind),
@@ -30,7 +30,7 @@ def now() -> str:
 
 
 def _git_commit() -> str | None:
-    """The commit of the source that is running, with a + where it was changed since; None outside a checkout."""
+    """The commit of the running source, with a + if it has changes; None outside a checkout."""
     try:
         found = subprocess.run(
             ["git", "describe", "--always", "--abbrev=40", "--dirty=+", "--match="],

@@ -1,6 +1,6 @@
-"""The JSON in a run's folder: logs line by line, and checks that what is read is what a training writes.
+"""The JSON in a run's folder: logs line by line, and checks of what is read.
 
-A damaged file must end in one sentence wherever it is read, so what readers rely on is checked here: keys and types.
+A damaged file must cause a UserError, never a traceback, so the keys and types that readers rely on are checked here.
 The ranges of options are in `Options`, those of settings in the agents.
 """
 
@@ -23,7 +23,7 @@ def parsed(path: pathlib.Path) -> Any:
 
 
 def _json(text: str) -> Any:
-    """What a text of JSON says; None if it is none."""
+    """The value of a text of JSON; None if it is not JSON."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError):
@@ -31,7 +31,7 @@ def _json(text: str) -> Any:
 
 
 def is_complete(config: Any) -> bool:
-    """Whether a config.json holds what is read from it; the values of its options apart."""
+    """Whether a config.json holds all that is read from it; the values of its options are not checked."""
     kinds = {"agent": str, "hyperparameters": dict, "task": str, "constants": dict, "options": dict}
     if not isinstance(config, dict) or not all(isinstance(config.get(key), kind) for key, kind in kinds.items()):
         return False
@@ -42,7 +42,7 @@ def is_complete(config: Any) -> bool:
 
 
 def _is_session(session: Any) -> bool:
-    """Whether it can be what `provenance` says of a process that trained."""
+    """Whether it can be a record of `provenance`."""
     if not isinstance(session, dict):
         return False
     return isinstance(session.get("versions", {}), dict) and isinstance(session.get("command", []), list)

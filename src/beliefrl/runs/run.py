@@ -1,4 +1,4 @@
-"""A run's folder: what a training leaves behind. Knows files, no reinforcement learning.
+"""A run's folder, which a training writes. This file knows files, no reinforcement learning.
 
     config.json           agent, task, options, versions, git commit, command line
     metrics/seed-0.jsonl  a line for every entry: {"step", "kind": "update" | "episode" | "evaluation", ...}
@@ -8,7 +8,7 @@
     curve.png             the learning curve
 
 Lines are written out one by one, so a killed training loses at most the line it was writing, which `rows` skips.
-Whatever is read is checked as it is read (`records`), so nobody has to check it again.
+What is read is checked on reading (`records`), so readers need not check it again.
 """
 
 import contextlib
@@ -35,7 +35,7 @@ class Run:
     """A run's folder, to be read."""
 
     def __init__(self, folder: str | os.PathLike[str]):
-        """Open a folder that a training made.
+        """Open the folder of a training.
 
         Raises:
             UserError: it does not exist, no training made it, its config.json is damaged, or it is no path.
@@ -60,7 +60,7 @@ class Run:
 
     @property
     def options(self) -> Options:
-        """The options of the training; those that only another version has are left out."""
+        """The options of the training; options of other versions are left out."""
         known = {field.name for field in dataclasses.fields(Options)}
         given = tuples(self.config["options"])
         return Options(**{name: value for name, value in given.items() if name in known})
@@ -132,7 +132,7 @@ class Run:
 
 
 class Recorder(Run):
-    """A run's folder, to be written by this process alone."""
+    """A run's folder that only this process writes."""
 
     def __init__(self, folder: str | os.PathLike[str], config: dict[str, Any] | None):
         """Make the folder; without a config, go on with one that exists.
@@ -161,7 +161,7 @@ class Recorder(Run):
         try:
             self.close()
         except Exception:
-            if kind is None:  # else the first error is the one to tell
+            if kind is None:  # else the first error is reported
                 raise
 
     def _open(self) -> None:
@@ -171,31 +171,31 @@ class Recorder(Run):
             try:
                 self._lines[seed] = path.open("a", buffering=1)
             except OSError as error:
-                raise UserError(f"{path} cannot be written ({error.strerror}): mend that, then try again.") from None
+                raise UserError(f"{path} cannot be written ({error.strerror}): fix that, then try again.") from None
             self._trackers[seed] = trackers.open_all(track, self.folder, seed, self.config)
 
     def note_end(self) -> None:
-        """Write down when this process has ended with the run, if the disk has room for it."""
+        """Record when this process has finished with the run; a full disk is ignored."""
         session = self.config["resumed"][-1] if self.config.get("resumed") else self.config
         session["ended"] = now()
         with contextlib.suppress(OSError):
             write_config(self.folder, self.config)
 
     def amend(self, changes: dict[str, Any], session: dict[str, Any]) -> None:
-        """Change the config, and add what goes on with the run to its `resumed`."""
+        """Change the config, and add a session to its `resumed`."""
         self.config |= changes
         self.config["resumed"] = [*self.config.get("resumed", ()), session]
         write_config(self.folder, self.config)
 
     def lengths(self) -> dict[int, int]:
-        """Bytes in the log of each seed, which are on the disk then."""
+        """Flush the log of each seed to the disk; returns their sizes in bytes."""
         for lines in self._lines.values():
             lines.flush()
             os.fsync(lines.fileno())
         return {seed: self._metrics(seed).stat().st_size for seed in self.seeds}
 
     def rewind(self, lengths: dict[int, int]) -> None:
-        """Cut the log of each seed back to so many bytes, and go on from there; 0 begins it again.
+        """Truncate the log of each seed to so many bytes, and append from there.
 
         Raises:
             UserError: a log is shorter.
@@ -211,21 +211,21 @@ class Recorder(Run):
         for seed in self.seeds:
             whole = [tracker for tracker in self._trackers[seed] if tracker.is_whole]
             for row in self.rows(seed) if whole else ():
-                _tell(whole, row["kind"], row["step"], row)
+                _track(whole, row["kind"], row["step"], row)
 
     def log(self, seed: int, kind: str, step: int, values: Row) -> None:
-        """Write one entry of a seed; numbers go to its trackers as well, of lists their mean."""
+        """Write one entry of a seed; its trackers get the numbers, and the means of lists."""
         self._lines[seed].write(json.dumps({"step": step, "kind": kind, **values}) + "\n")
-        _tell(self._trackers[seed], kind, step, values)
+        _track(self._trackers[seed], kind, step, values)
 
     def flush(self) -> None:
-        """Bring everything logged so far onto the disk."""
+        """Flush the trackers."""
         for of_seed in self._trackers.values():
             for tracker in of_seed:
                 tracker.flush()
 
     def save(self, agents: Any, but: Collection[int] = ()) -> None:
-        """Save the agents of all seeds but some, of which what was saved before stays; whole or not at all."""
+        """Save the agents of all seeds atomically; those of the seeds `but` (indices) stay as they were saved."""
         path, saved = self.folder / "agent.safetensors", arrays.copied(agents)
         before = arrays.load(path) if but and path.exists() else {}
         for name, kept in before.items():
@@ -237,18 +237,18 @@ class Recorder(Run):
         write_whole(self.folder / "results.json", (json.dumps(results, indent=2) + "\n").encode())
 
     def close(self) -> None:
-        """Close the logs, and let others write the folder. All are closed, even if closing one of them fails."""
+        """Close logs and trackers, and unlock the folder. All are closed, even if closing one of them fails."""
         with contextlib.ExitStack() as stack:
             stack.callback(self._lock.close)
             for writer in (*self._lines.values(), *(each for of_seed in self._trackers.values() for each in of_seed)):
                 stack.callback(writer.close)
 
 
-def _tell(told: list[Tracker], kind: str, step: int, values: Row) -> None:
+def _track(trackers: list[Tracker], kind: str, step: int, values: Row) -> None:
     numbers = {
         f"{kind}/{name}": float(np.mean(value))
         for name, value in values.items()
         if name not in ("step", "kind") and isinstance(value, int | float | list)
     }
-    for tracker in told:
+    for tracker in trackers:
         tracker.log(step, numbers)

@@ -17,9 +17,9 @@ from beliefrl.types import UserError, said
 
 @runtime_checkable
 class Tracker(Protocol):
-    """Is told the numbers of one seed."""
+    """Receives the numbers of one seed."""
 
-    is_whole: bool  # told everything again when a training goes on; else only what is new
+    is_whole: bool  # receives all entries again when a training is resumed; else only new ones
 
     def log(self, step: int, values: dict[str, float]) -> None: ...
     def flush(self) -> None: ...
@@ -29,8 +29,8 @@ class Tracker(Protocol):
 class TensorBoard:
     """Event files in tensorboard/seed-N.
 
-    tensorboardX's SummaryWriter writes in a thread of its own. On a full disk that thread ends, and whoever logs waits
-    for it for ever. So the events are written here, and an error is raised where it happens.
+    tensorboardX's SummaryWriter writes in a thread of its own. On a full disk that thread ends, and the caller
+    waits for it for ever. So the events are written here, and an error is raised where it occurs.
     """
 
     is_whole = True
@@ -114,7 +114,7 @@ def open_all(names: Sequence[str], folder: pathlib.Path, seed: int, config: dict
     for name in names:
         try:
             opened.append(TRACKERS[name](folder, seed, config))
-        except Exception as error:  # whatever a stranger's library may raise
+        except Exception as error:  # the library may raise anything
             for tracker in opened:
                 tracker.close()
             raise UserError(f"track={name} cannot be opened: {said(error)}.") from None

@@ -24,7 +24,7 @@ class Fault(UserError):
 
     seeds: Any = None  # of a training: what was learned until then (`host_loop`)
     step: int = 0
-    told: Any = None
+    stretch: Any = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -1,10 +1,10 @@
-"""What a step costs: milliseconds per environment step at any sizes, in parts, beside what the machine can do.
+"""The cost of a step: milliseconds per environment step at any sizes, in parts, and the speed of the machine.
 
 The task is made up (noise as observations), so only its sizes count. `ms_per_step` is the training loop itself, with
 the pre-training spread over the 100,000 steps of the paper's scalability table. Each part named `alone` is timed in a
 program of its own, and together they can exceed the whole: there each call writes networks and optimisers to fresh
 memory, where the loop updates them in place, and each update is a call, where the loop has those of a cycle in one
-program. They tell what is large and what is small, not shares of a step. Timings are medians.
+program. They show which parts are large, not shares of a step. Timings are medians.
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ REPEATS = 9
 
 @dataclasses.dataclass(frozen=True)
 class Noise:
-    """A task of given sizes with nothing in it."""
+    """A task of given sizes whose observations are noise."""
 
     obs_dim: int
     action_dim: int
@@ -78,7 +78,7 @@ def parameters(tree: Any) -> int:
 
 
 class _Timed:
-    """Phases called in turn on seeds that each call uses up, and how long each took."""
+    """Calls phases in turn on the same seeds, and times each."""
 
     def __init__(self, agent: Agent, task: Noise, seeds: int):
         self.agent, self.step = agent, 0

@@ -1,4 +1,4 @@
-"""What a trained agent is worth: returns over episodes and seeds, with sampled and with mode actions."""
+"""Returns of trained agents over episodes and seeds, with sampled and with mode actions."""
 
 import contextlib
 import os
@@ -20,7 +20,7 @@ from beliefrl.training.phases import evaluate as evaluate_seed
 from beliefrl.training.rollout import Episode
 from beliefrl.types import LARGEST, UserError, tuples
 
-MODES = ("sampled", "mode")  # how actions are chosen; the first axis of an evaluation's leaves behind seeds
+MODES = ("sampled", "mode")  # how actions are chosen; the axis of an evaluation's leaves after that of seeds
 
 
 def summary(result: Episode, has_success: bool) -> dict[str, Any]:
@@ -28,14 +28,14 @@ def summary(result: Episode, has_success: bool) -> dict[str, Any]:
 
     Leaves of `result` are (seed, mode, episodes).
     """
-    total, success = np.asarray(result.total), np.asarray(result.success)
+    returns, success = np.asarray(result.episode_return), np.asarray(result.success)
     table = {}
     for index, mode in enumerate(MODES):
-        seeds = total[:, index].mean(axis=-1)
-        there = seeds[np.isfinite(seeds)]  # a seed that has diverged has no returns
+        seeds = returns[:, index].mean(axis=-1)
+        finite = seeds[np.isfinite(seeds)]  # a diverged seed has no returns
         table[mode] = {
-            "mean": float(there.mean()),
-            "sem": float(there.std(ddof=1) / np.sqrt(there.size)) if there.size > 1 else None,
+            "mean": float(finite.mean()),
+            "sem": float(finite.std(ddof=1) / np.sqrt(finite.size)) if finite.size > 1 else None,
             "seeds": [float(mean) if np.isfinite(mean) else None for mean in seeds],
             "success": float(success[:, index].mean()) if has_success else None,
             "seeds_success": [float(rate) for rate in success[:, index].mean(axis=-1)] if has_success else None,
@@ -102,7 +102,7 @@ def task_of(run: Run | str | os.PathLike[str]) -> Any:
 
 @contextlib.contextmanager
 def _naming(run: Run) -> Iterator[None]:
-    """A UserError about what the run's config.json says names that file."""
+    """Name config.json in a UserError about its content."""
     try:
         yield
     except UserError as error:

@@ -25,10 +25,10 @@ class Evaluation:
         task: GymnasiumTask,
         seeds: Sequence[int],
         processes: str,
-        tell: Callable[[str], None] | None = None,
+        notify: Callable[[str], None] | None = None,
     ):
-        """They are made at the first evaluation; `processes` and `tell` are as in `Lockstep`."""
-        self.agent, self.task, self.seeds, self.processes, self.tell = agent, task, seeds, processes, tell
+        """The environments are made at the first evaluation; `processes` and `notify` are as in `Lockstep`."""
+        self.agent, self.task, self.seeds, self.processes, self.notify = agent, task, seeds, processes, notify
         self.environments: Lockstep | None = None
         lanes = jax.vmap(partial(_perceive, agent, task.spec), in_axes=(None, 0, 0, 0, 0, None))
         self._perceive = jax.jit(jax.vmap(lanes, in_axes=(0, 0, 0, 0, None, None)))
@@ -37,7 +37,7 @@ class Evaluation:
         """`episodes` episodes, one after the other; leaves (seed, 2, episodes)."""
         if self.environments is None:
             lanes = [f"evaluation of seed {seed}" for seed in self.seeds for _ in range(2)]
-            self.environments = Lockstep(self.task, lanes, self.processes, self.tell)
+            self.environments = Lockstep(self.task, lanes, self.processes, self.notify)
         keys = jax.vmap(lambda key: jax.random.split(key, 2))(keys)
         obs = self.environments.reset(environment_seeds(keys).reshape(-1))
         lanes = len(obs)
@@ -46,18 +46,18 @@ class Evaluation:
         step = Timestep(obs, never.astype(np.float32), action, ~never, never)
         empty = self.agent.reset(self.task.spec)
         memory = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*keys.shape, *leaf.shape)), empty)
-        record, total, length = _Record(lanes, episodes), np.zeros(lanes), np.zeros(lanes, int)
+        record, returns, length = _Record(lanes, episodes), np.zeros(lanes), np.zeros(lanes, int)
         explore, time = np.array([True, False]), 0
         while not record.full:
             perceived = jax.tree.map(lambda leaf: leaf.reshape(*keys.shape, *leaf.shape[1:]), step)
             action, memory = self._perceive(states, memory, perceived, keys, explore, time)
             action = np.asarray(action).reshape(lanes, -1)
             obs, reward, terminated, truncated, success = self.environments.step(action)
-            total, length, done, time = total + reward, length + 1, terminated | truncated, time + 1
-            record.add(done, total, length, success)
+            returns, length, done, time = returns + reward, length + 1, terminated | truncated, time + 1
+            record.add(done, returns, length, success)
             if done.any():
                 obs = self.environments.restart(done)
-                total, length = np.where(done, 0.0, total), np.where(done, 0, length)
+                returns, length = np.where(done, 0.0, returns), np.where(done, 0, length)
             step = Timestep(obs, reward * ~done, action * ~done[:, None], done, never)
         return jax.tree.map(lambda leaf: leaf.reshape(*keys.shape, episodes), record.episodes)
 
@@ -97,7 +97,7 @@ class _Record:
         return bool(self.episodes.done.all())
 
     def add(self, done: Any, *values: Any) -> None:
-        """What ended, where `done` and still wanted; values are Episode's other fields, leaves (lane,)."""
+        """Add the episodes that are `done` and still wanted; values are Episode's other fields, leaves (lane,)."""
         lanes = np.flatnonzero(done & (self.count < self.episodes.done.shape[1]))
         for column, value in zip(self.episodes, (done, *values), strict=True):
             column[lanes, self.count[lanes]] = value[lanes]

@@ -5,7 +5,7 @@ A call of a compiled function costs as much as acting does, so there is one for 
 
     act             the first action of a stretch of steps
     environments    a step, in lockstep
-    go on           record what they answered; when a cycle's steps are done, learn (`phases.learn_cycle`); act again
+    go on           record their results; when a cycle's steps are done, learn (`phases.learn_cycle`); act again
 
 A fault of an environment ends the training with what was learned and recorded until then.
 """
@@ -38,12 +38,11 @@ def program(
     episodes: int,
     seeds: Sequence[int],
     processes: str,
-    tell: Callable[[str], None] | None = None,
+    notify: Callable[[str], None] | None = None,
 ) -> Program:
-    """The phases of training with environments of their own for each of `seeds`; `tell` is as in `Lockstep`."""
-    _keep_memory()
-    loop = HostLoop(agent, task, capacity, Lockstep(task, [f"seed {seed}" for seed in seeds], processes, tell))
-    evaluation = Evaluation(agent, task, seeds, processes, tell)
+    """The phases of training, with an environment for each of `seeds`; `processes`, `notify`: as in `Lockstep`."""
+    loop = HostLoop(agent, task, capacity, Lockstep(task, [f"seed {seed}" for seed in seeds], processes, notify))
+    evaluation = Evaluation(agent, task, seeds, processes, notify)
 
     def close() -> None:
         loop.environments.close()
@@ -62,8 +61,8 @@ def program(
     )
 
 
-def _keep_memory() -> None:
-    """Let the C library keep freed memory for the next call.
+def keep_memory() -> None:
+    """Let the C library keep freed memory for the next call: a setting of the whole process.
 
     A compiled function takes its scratch memory anew at every call, and where that is large the C library gives it back
     to the system each time: 10 ms of VRM's updates of a cycle were the system clearing pages again.
@@ -76,23 +75,23 @@ def _keep_memory() -> None:
             libc.mallopt(trim_threshold, most)
 
 
-class Deed(NamedTuple):
-    """What the agent does at the moment in hand."""
+class ActorOutput(NamedTuple):
+    """What the agent returns at the current timestep."""
 
     action: Float[Array, "*seed action"]
-    memory: Any  # once it has perceived that moment
+    memory: Any  # after that timestep
 
 
-class Answer(NamedTuple):
-    """What the agent did, and what its environment answered."""
+class StepResult(NamedTuple):
+    """What the agent returned, and what its environment returned for that action."""
 
-    deed: Deed
+    output: ActorOutput
     obs: Any  # (seed, obs)
     reward: Any  # (seed,)
     terminated: Any  # (seed,)
     done: Any  # (seed,)
     success: Any  # (seed,)
-    fresh: Any  # (seed, obs), the first observation of the next episode, where done
+    fresh: Any  # (seed, obs), the first observation of the next episode where done
 
 
 class HostLoop:
@@ -118,69 +117,69 @@ class HostLoop:
         return jax.eval_shape(self._begin, keys, obs)
 
     def revive(self, seeds: SeedState, step: int) -> SeedState:
-        """Seeds whose environments were not saved: a new episode begins, as if the one in hand had never gone on."""
+        """Seeds read from a checkpoint, which has no environments: a new episode begins in each."""
         keys = jax.vmap(lambda key: step_key(key, jnp.asarray(step), REVIVE))(seeds.key)
         return seeds._replace(actor=self._first(self.environments.reset(environment_seeds(keys))))
 
     def explore(self, seeds: SeedState, first: int, steps: int) -> tuple[SeedState, Stretch]:
-        """Environment steps without updates; none of them only compiles."""
-        told, deed, networks = _Told(), self._act(seeds, first), self.agent.networks(seeds.state)
+        """Environment steps without updates; 0 only compiles."""
+        log, output, networks = _StretchLog(), self._act(seeds, first), self.agent.networks(seeds.state)
         if steps == 0:
-            self._compile(seeds, deed, learns=False)
+            self._compile(seeds, output, learns=False)
         for step in range(first, first + steps):
-            answer = self._step(seeds, deed, step, told)
-            rest, deed, episode = self._go_on(networks, seeds._replace(state=()), answer, step)
+            result = self._step(seeds, output, step, log)
+            rest, output, episode = self._go_on(networks, seeds._replace(state=()), result, step)
             seeds = rest._replace(state=seeds.state)
-            told.episodes.append(episode)
-        return seeds, told.stretch()
+            log.episodes.append(episode)
+        return seeds, log.stretch()
 
     def learn(self, seeds: SeedState, first: int, cycles: int) -> tuple[SeedState, Stretch]:
-        """`cycles` cycles of steps and updates from environment step `first` on; none of them only compiles."""
-        told, deed, cycle = _Told(), self._act(seeds, first), self.agent.cycle
+        """`cycles` cycles of steps and updates from environment step `first` on; 0 only compiles."""
+        log, output, cycle = _StretchLog(), self._act(seeds, first), self.agent.cycle
         if cycles == 0:
-            self._compile(seeds, deed, learns=True)
+            self._compile(seeds, output, learns=True)
         for step in range(first, first + cycles * cycle):
-            answer = self._step(seeds, deed, step, told)
+            result = self._step(seeds, output, step, log)
             if (step + 1 - first) % cycle:
-                rest, deed, episode = self._go_on(
-                    self.agent.networks(seeds.state), seeds._replace(state=()), answer, step
+                rest, output, episode = self._go_on(
+                    self.agent.networks(seeds.state), seeds._replace(state=()), result, step
                 )
                 seeds = rest._replace(state=seeds.state)
             else:
-                seeds, deed, episode, metrics = self._learn(seeds, answer, step)
-                told.metrics.append(metrics)
-            told.episodes.append(episode)
-        return seeds, told.stretch()
+                seeds, output, episode, metrics = self._learn(seeds, result, step)
+                log.metrics.append(metrics)
+            log.episodes.append(episode)
+        return seeds, log.stretch()
 
-    def _compile(self, seeds: SeedState, deed: "Deed", learns: bool) -> None:
-        """Compile what follows a step of the environments, so that no compilation is taken for a slow environment."""
-        lanes = len(deed.action)
+    def _compile(self, seeds: SeedState, output: ActorOutput, learns: bool) -> None:
+        """Compile what follows a step of the environments: else a compilation would look like a slow environment."""
+        lanes = len(output.action)
         obs, number, never = (
             np.zeros((lanes, self.spec.obs_dim), np.float32),
             np.zeros(lanes, np.float32),
             np.zeros(lanes, bool),
         )
-        answer = Answer(deed, obs, number, never, never, never, obs)
+        result = StepResult(output, obs, number, never, never, never, obs)
         if isinstance(self._go_on, jax.stages.Wrapped) and (self.agent.cycle > 1 or not learns):
             rest = seeds._replace(state=())
-            self._go_on = self._go_on.lower(self.agent.networks(seeds.state), rest, answer, 0).compile()
+            self._go_on = self._go_on.lower(self.agent.networks(seeds.state), rest, result, 0).compile()
         if learns:
-            self._learn = self._learn.lower(seeds, answer, 0).compile()
+            self._learn = self._learn.lower(seeds, result, 0).compile()
 
-    def _step(self, seeds: SeedState, deed: "Deed", step: int, told: "_Told") -> "Answer":
+    def _step(self, seeds: SeedState, output: ActorOutput, step: int, log: "_StretchLog") -> StepResult:
         """One step of every environment."""
         try:
-            obs, reward, terminated, truncated, success = self.environments.step(np.asarray(deed.action))
+            obs, reward, terminated, truncated, success = self.environments.step(np.asarray(output.action))
             done = terminated | truncated
             fresh = self.environments.restart(done) if done.any() else obs
         except Fault as fault:
-            fault.seeds, fault.step, fault.told = seeds, step, told.stretch()
+            fault.seeds, fault.step, fault.stretch = seeds, step, log.stretch()
             raise
-        return Answer(deed, obs, reward, terminated, done, success, fresh)
+        return StepResult(output, obs, reward, terminated, done, success, fresh)
 
 
-class _Told:
-    """What a stretch tells, gathered on the way."""
+class _StretchLog:
+    """The metrics and episodes of a stretch, gathered step by step."""
 
     def __init__(self):
         self.metrics: list[Metrics] = []  # of every cycle
@@ -198,37 +197,37 @@ def _begin(agent: Agent, spec: Spec, capacity: int, key: Key[Array, ""], obs: Fl
     return phases.seed_of(agent, spec, capacity, rollout.first(agent, spec, (), obs), key_state, key)
 
 
-def _act(agent: Agent, seed: SeedState, step: Int[Array, ""]) -> Deed:
+def _act(agent: Agent, seed: SeedState, step: Int[Array, ""]) -> ActorOutput:
     key_move, _, _ = jax.random.split(step_key(seed.key, step, ACT), 3)
-    return Deed(*rollout.act(agent, seed.state, seed.actor, key_move, jnp.array(True)))
+    return ActorOutput(*rollout.act(agent, seed.state, seed.actor, key_move, jnp.array(True)))
 
 
 def _record(
-    agent: Agent, spec: Spec, seed: SeedState, answer: Answer, step: Int[Array, ""]
+    agent: Agent, spec: Spec, seed: SeedState, result: StepResult, step: Int[Array, ""]
 ) -> tuple[SeedState, Episode]:
-    """Record what the environment answered at this step."""
+    """Record the result of this step."""
     _, key_last, _ = jax.random.split(step_key(seed.key, step, ACT), 3)
-    action, memory = answer.deed
-    after = rollout.arrive(seed.actor, memory, action, (), answer.obs, answer.reward, answer.terminated)
-    fresh = rollout.first(agent, spec, (), answer.fresh)
-    actor, replay = rollout.record(agent, seed.state, seed.replay, seed.actor, after, fresh, answer.done, key_last)
-    episode = Episode(answer.done, after.total, after.length, answer.success)
+    action, memory = result.output
+    after = rollout.arrive(seed.actor, memory, action, (), result.obs, result.reward, result.terminated)
+    fresh = rollout.first(agent, spec, (), result.fresh)
+    actor, replay = rollout.record(agent, seed.state, seed.replay, seed.actor, after, fresh, result.done, key_last)
+    episode = Episode(result.done, after.episode_return, after.length, result.success)
     return seed._replace(actor=actor, replay=replay), episode
 
 
 def _go_on(
-    agent: Agent, spec: Spec, networks: Any, rest: SeedState, answer: Answer, step: Int[Array, ""]
-) -> tuple[SeedState, Deed, Episode]:
+    agent: Agent, spec: Spec, networks: Any, rest: SeedState, result: StepResult, step: Int[Array, ""]
+) -> tuple[SeedState, ActorOutput, Episode]:
     """Record, and act again."""
-    seed, episode = _record(agent, spec, rest._replace(state=networks), answer, step)
+    seed, episode = _record(agent, spec, rest._replace(state=networks), result, step)
     return seed._replace(state=()), _act(agent, seed, step + 1), episode
 
 
 def _learn(
-    agent: Agent, spec: Spec, seed: SeedState, answer: Answer, step: Int[Array, ""]
-) -> tuple[SeedState, Deed, Episode, Metrics]:
+    agent: Agent, spec: Spec, seed: SeedState, result: StepResult, step: Int[Array, ""]
+) -> tuple[SeedState, ActorOutput, Episode, Metrics]:
     """Record the last step of a cycle, learn, and act again."""
-    seed, episode = _record(agent, spec, seed, answer, step)
+    seed, episode = _record(agent, spec, seed, result, step)
     state, metrics = phases.learn_cycle(agent, seed, step + 1 - agent.cycle)
     seed = seed._replace(state=state)
     return seed, _act(agent, seed, step + 1), episode, metrics

@@ -1,13 +1,12 @@
-"""Gymnasium environments side by side, one a lane, each in this process or in one of its own.
+"""Gymnasium environments stepped together, one per lane, in this process or each in a process of its own.
 
-An episode ends where its lane says so and begins again when it is told to: the last observation is seen as well.
+The environments do not reset themselves: `restart` begins the next episode, after its last observation was returned.
 """
 
 import contextlib
 import multiprocessing
 import os
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -26,8 +25,8 @@ HANDOVER = 5e-4  # seconds that giving a step to other processes costs, about
 SLOW = 60.0  # seconds after which a call that has not returned is reported
 
 
-class Answers(NamedTuple):
-    """What the environments answer, numpy arrays."""
+class StepResults(NamedTuple):
+    """What the environments return for a step, numpy arrays."""
 
     obs: Any  # (lane, obs) float32
     reward: Any  # (lane,) float32
@@ -37,7 +36,7 @@ class Answers(NamedTuple):
 
 
 class _Call(NamedTuple):
-    """Of the environments: what was called, and when."""
+    """A call of the environments, and when it began."""
 
     name: str
     began: float
@@ -50,16 +49,17 @@ class Lockstep:
         self,
         task: GymnasiumTask,
         lanes: Sequence[str],
-        processes: str = "auto",
-        tell: Callable[[str], None] | None = None,
+        processes: str = "never",
+        notify: Callable[[str], None] | None = None,
     ):
-        """Make an environment for each of `lanes`, the names under which their faults are told.
+        """Make an environment for each of `lanes`, the names of the environments in messages.
 
         Args:
-            task: what they are of.
+            task: the task of all of them.
             lanes: for example "seed 0".
-            processes: "always" gives each a process of its own, "never" none, "auto" where that pays.
-            tell: is called by another thread with a sentence when a step, a reset or the making takes longer than SLOW.
+            processes: "always" gives each a process of its own, "never" none, "auto" decides by a measurement.
+                Each process imports the main module of this one: guard it by `if __name__ == "__main__":`.
+            notify: called from another thread with a sentence when making, a reset or a step takes longer than SLOW.
 
         Raises:
             UserError: the environment cannot be made, or is not supported.
@@ -69,8 +69,8 @@ class Lockstep:
         self._envs: Any = None
         self._call: _Call | None = None  # the call of the environments that has not returned
         self._closed = threading.Event()
-        if tell is not None:
-            threading.Thread(target=self._watch, args=(tell,), daemon=True).start()
+        if notify is not None:
+            threading.Thread(target=self._watch, args=(notify,), daemon=True).start()
         factories = [_Factory(task, lane) for lane in lanes]
         with self._calling("gymnasium.make"):
             self.apart = processes == "always" or (processes == "auto" and _pays(task, len(lanes)))
@@ -81,26 +81,26 @@ class Lockstep:
                 self._envs = SyncVectorEnv(factories, autoreset_mode=AutoresetMode.DISABLED)
 
     def reset(self, seeds: Int[np.ndarray, " lane"]) -> Any:
-        """Begin an episode everywhere; returns what is observed, (lane, obs)."""
+        """Begin an episode in every environment; returns the observations, (lane, obs)."""
         with self._calling("reset"):
             return self._envs.reset(seed=[int(seed) for seed in seeds])[0]
 
-    def step(self, actions: Float[np.ndarray, "lane action"]) -> "Answers":
-        """Act everywhere."""
+    def step(self, actions: Float[np.ndarray, "lane action"]) -> StepResults:
+        """Step every environment."""
         self.steps += 1
         with self._calling("step"):
             obs, reward, terminated, truncated, info = self._envs.step(actions)
-        return Answers(obs, reward.astype(np.float32), terminated, truncated, np.asarray(info["success"], bool))
+        return StepResults(obs, reward.astype(np.float32), terminated, truncated, np.asarray(info["success"], bool))
 
     def restart(self, done: Bool[np.ndarray, " lane"]) -> Any:
-        """Begin an episode where one is done; returns what is observed everywhere, (lane, obs)."""
+        """Begin an episode where `done`; returns the observations of all environments, (lane, obs)."""
         with self._calling("reset"):
             return self._envs.reset(options={"reset_mask": done})[0]
 
     def close(self) -> None:
-        """Close them all; what goes wrong in that concerns nobody any more."""
+        """Close all environments; errors while closing are ignored."""
         self._closed.set()
-        if self.apart and self._call is not None:  # they would be asked to finish their step first
+        if self.apart and self._call is not None:  # a regular close would wait for the step to end
             for process in self._envs.processes:
                 process.terminate()
                 process.join()
@@ -110,7 +110,7 @@ class Lockstep:
 
     @contextlib.contextmanager
     def _calling(self, name: str) -> Iterator[None]:
-        """What is called in the environments; a lane's process that has died meanwhile is a Fault."""
+        """Note the call that is under way. Raises a Fault if a lane's process dies during it."""
         self._call = _Call(name, time.monotonic())
         try:
             with _silence():
@@ -119,7 +119,7 @@ class Lockstep:
         except (EOFError, ConnectionError, BrokenPipeError):
             raise Fault(self._death()) from None
 
-    def _watch(self, tell: Callable[[str], None]) -> None:
+    def _watch(self, notify: Callable[[str], None]) -> None:
         """Report every call that takes longer than SLOW, once."""
         reported = None
         while not self._closed.wait(SLOW / 60):
@@ -128,8 +128,8 @@ class Lockstep:
                 continue
             reported = call
             at = f" (step {self.steps})" if self.steps else ""
-            with contextlib.suppress(Exception):  # whoever listens must not end the watch
-                tell(f"{self.task.name}{at}: {call.name} has not returned for {SLOW:.0f} s: it is slow, or it hangs.")
+            with contextlib.suppress(Exception):  # an error of the listener must not end the watch
+                notify(f"{self.task.name}{at}: {call.name} has not returned for {SLOW:.0f} s: it is slow, or it hangs.")
 
     def _death(self) -> str:
         dead = []
@@ -143,20 +143,20 @@ class Lockstep:
 
 
 class _Factory:
-    """Makes one lane's environment, in whatever process."""
+    """Makes one lane's environment, in this process or a worker."""
 
     def __init__(self, task: GymnasiumTask, lane: str):
         self.task, self.lane = task, lane
 
     def __call__(self) -> Environment:
         if multiprocessing.parent_process() is not None:
-            signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is meant for the training, which ends us
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the training, which ends the workers
         return self.task.environment(self.lane)
 
 
 @contextlib.contextmanager
 def _silence() -> Iterator[None]:
-    """Gymnasium prints a worker's traceback; its sentence is told anyway."""
+    """Keep Gymnasium from printing a worker's traceback: the Fault carries its message."""
     level, logger.min_level = logger.min_level, logger.ERROR + 1
     try:
         yield
@@ -165,14 +165,9 @@ def _silence() -> Iterator[None]:
 
 
 def _pays(task: GymnasiumTask, lanes: int) -> bool:
-    """Whether processes of their own save more than they cost: by the time that some random steps take.
-
-    A process begins by importing the program that started it, so a script would train again in each unless it guards
-    against that; only from the command line is it sure to.
-    """
+    """Whether processes of their own save more than they cost: by the time that some random steps take."""
     cores = min(lanes, os.cpu_count() or 1)
-    by_command = os.path.basename(sys.argv[0]) in ("beliefrl", "beliefrl.exe") or "beliefrl.cli" in sys.modules
-    return by_command and cores > 1 and lanes * step_seconds(task) * (1 - 1 / cores) > HANDOVER
+    return cores > 1 and lanes * step_seconds(task) * (1 - 1 / cores) > HANDOVER
 
 
 def step_seconds(task: GymnasiumTask, steps: int = 20) -> float:

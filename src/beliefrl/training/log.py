@@ -1,4 +1,4 @@
-"""What of a training's events is written in the log of each seed."""
+"""What a training writes of its events in the log of each seed."""
 
 from collections.abc import Collection
 from typing import Any
@@ -26,14 +26,14 @@ def finite(states: Any) -> Bool[Array, " seed"]:
 
 
 def without(evaluation: Episode, lost: Collection[int]) -> Episode:
-    """The same with no numbers of the seeds that are lost."""
-    total: Any = np.array(evaluation.total)
-    total[sorted(lost)] = np.nan
-    return evaluation._replace(total=total)
+    """The same evaluation with NaN as the returns of the `lost` seeds (indices)."""
+    returns: Any = np.array(evaluation.episode_return)
+    returns[sorted(lost)] = np.nan
+    return evaluation._replace(episode_return=returns)
 
 
 def record(recorder: Recorder, event: Event, has_success: bool, lost: Collection[int]) -> dict[str, Any] | None:
-    """Log what an event tells of every seed that is not lost; returns the summary of an evaluation."""
+    """Log an event for every seed that is not lost; returns the summary of an evaluation."""
     metrics = {name: np.asarray(values) for name, values in event.metrics.items()}
     for index, seed in enumerate(recorder.seeds):
         if index in lost:
@@ -59,13 +59,13 @@ def record(recorder: Recorder, event: Event, has_success: bool, lost: Collection
 
 def _episode(episodes: Episode, end: Any, has_success: bool) -> dict[str, Any]:
     success = {"success": bool(episodes.success[end])} if has_success else {}
-    return {"return": float(episodes.total[end]), "length": int(episodes.length[end])} | success
+    return {"return": float(episodes.episode_return[end]), "length": int(episodes.length[end])} | success
 
 
 def _evaluated(result: Episode, has_success: bool) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for index, mode in enumerate(MODES):
-        values[mode] = [float(total) for total in result.total[index]]
+        values[mode] = [float(value) for value in result.episode_return[index]]
         if has_success:
             values[f"{mode}_success"] = [bool(success) for success in result.success[index]]
     return values

@@ -7,7 +7,7 @@
 The step counter stays outside what is mapped over seeds, and each phase is a compiled function of its own, called
 for a stretch of steps whose number is an argument: one compilation serves all stretches, and no result depends on
 how the training is cut into them. Random keys are derived from the seed's key and the running number of the step.
-`train` decides what is called when.
+`schedule` decides which phase is called when.
 """
 
 from collections.abc import Callable
@@ -35,7 +35,7 @@ def stretch_length(agent: Agent) -> int:
 
 
 class SeedState(NamedTuple):
-    """All of one training. Mapped over seeds, every leaf has a leading axis `seed`."""
+    """All arrays of one training. Mapped over seeds, every leaf has a leading axis `seed`."""
 
     state: Any  # the agent's
     actor: ActorState
@@ -44,14 +44,14 @@ class SeedState(NamedTuple):
 
 
 class Stretch(NamedTuple):
-    """What a stretch of steps tells, of one seed."""
+    """The results of a stretch of steps, of one seed."""
 
     metrics: Metrics  # means over its updates
     episodes: Episode | None  # leaves (stretch,): one entry a step, done only where an episode ended
 
 
 def begin(agent: Agent, task: Task, capacity: int, key: Key[Array, ""]) -> SeedState:
-    """A seed before its first step; `capacity` moments fit its replay."""
+    """A seed before its first step; its replay holds `capacity` timesteps."""
     key_state, key_actor, key = jax.random.split(key, 3)
     return seed_of(agent, task.spec, capacity, rollout.begin(agent, task, key_actor), key_state, key)
 
@@ -59,8 +59,8 @@ def begin(agent: Agent, task: Task, capacity: int, key: Key[Array, ""]) -> SeedS
 def seed_of(
     agent: Agent, spec: Spec, capacity: int, actor: ActorState, key_state: Key[Array, ""], key: Key[Array, ""]
 ) -> SeedState:
-    """A new agent and an empty replay for an actor at its first moment."""
-    return SeedState(agent.init(key_state, spec), actor, ring.init(rollout.moment(agent, actor), capacity), key)
+    """A new agent and an empty replay for an actor at its first timestep."""
+    return SeedState(agent.init(key_state, spec), actor, ring.init(rollout.stored(agent, actor), capacity), key)
 
 
 def _no_episodes(agent: Agent) -> Episode:
@@ -121,7 +121,7 @@ def pretrain(
 
 
 def refresh(agent: Agent, spec: Spec, seed: SeedState) -> SeedState:
-    """Perceive again, with the pre-trained networks, everything recorded so far (at most 2 moments a step)."""
+    """Perceive again, with the pre-trained networks, everything recorded so far (at most 2 timesteps a step)."""
     length = min(2 * agent.step_start_rl, ring.capacity(seed.replay))
     key = jax.random.fold_in(seed.key, REFRESH)
     actor, replay = rollout.refresh(agent, spec, seed.state, seed.actor, seed.replay, key, length)
@@ -148,7 +148,7 @@ def _cycle(
 ) -> tuple[SeedState, Episode, Metrics]:
     """One cycle, from environment step `first` on, whose entries in the log begin at `index`.
 
-    Its moments are added before any are drawn, and in a loop whose length XLA does not know (it would inline one of a
+    Its timesteps are added before any are drawn, and in a loop whose length XLA does not know (it would inline one of a
     single step): in either other form XLA copies the whole ring.
     """
 
@@ -164,7 +164,7 @@ def _cycle(
 
 
 def learn_cycle(agent: Agent, seed: SeedState, first: Int[Array, ""]) -> tuple[Any, Metrics]:
-    """What is learned when the steps of the cycle that began at environment step `first` are done: the new state."""
+    """Learn after the steps of the cycle that began at environment step `first`; returns the new state."""
     windows = ring.sample(seed.replay, step_key(seed.key, first, SAMPLE), agent.cycle_windows, agent.window)
     state, batches, model_metrics = agent.begin_cycle(seed.state, windows, step_key(seed.key, first, CYCLE))
 
@@ -198,11 +198,11 @@ class Program(NamedTuple):
     evaluate: Callable[..., Episode]  # states (seed, ...), keys (seed,); leaves (seed, 2, episodes)
     shapes: Callable[..., SeedState]  # keys (seed,); what `begin` gives, without its numbers
     revive: Callable[..., SeedState] = lambda seeds, step: seeds  # after they were read from a checkpoint
-    close: Callable[[], None] = lambda: None  # when no phase will be called any more
+    close: Callable[[], None] = lambda: None  # after the last phase
 
 
 def compile_program(agent: Agent, task: Task, capacity: int, episodes: int) -> Program:
-    """The phases as compiled functions. Seeds given to one are used up: their memory is taken over."""
+    """The phases as compiled functions. They donate the memory of the seeds that they are given."""
 
     def mapped(function: Callable[..., Any], numbers: int) -> Callable[..., Any]:
         return jax.jit(jax.vmap(function, in_axes=(0, *[None] * numbers)), donate_argnums=0)

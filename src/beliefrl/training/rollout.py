@@ -1,14 +1,14 @@
-"""An agent in its task: act, step, time limit, reset, record; and evaluation. Only this file knows episodes.
+"""An agent in its task: act, step, time limit, reset, record; and evaluation. No other file knows what an episode is.
 
-What happens in one environment step, at moment t of an episode:
+What happens in one environment step, at timestep t of an episode:
 
-    the agent perceives moment t and acts        -> a_t, memory
-    the replay keeps moment t and the agent's note
-    the task steps                               -> moment t+1
-    if it is terminal or the time limit is reached, the replay keeps moment t+1 as well and a new episode begins
+    the agent perceives timestep t and acts        -> a_t, memory
+    the replay stores timestep t and the agent's note
+    the task steps                               -> timestep t+1
+    if it is terminal or the time limit is reached, the replay stores timestep t+1 as well and a new episode begins
 
-So every step of the loop is one step of the environment, and the moment in hand is never in the replay yet.
-All functions are for one seed; `train` maps them over seeds.
+So every step of the loop is one step of the environment, and the current timestep is never in the replay yet.
+All functions are for one seed; `phases` maps them over seeds.
 """
 
 from typing import Any, NamedTuple
@@ -25,20 +25,20 @@ from beliefrl.types import Spec, StoredTimestep, Timestep
 
 
 class ActorState(NamedTuple):
-    """One agent at one moment of one episode."""
+    """One agent at one timestep of one episode."""
 
     task_state: Any
-    step: Timestep  # the moment in hand
-    memory: Any  # before that moment is perceived
+    step: Timestep  # the current timestep
+    memory: Any  # before that timestep is perceived
     length: Int[Array, ""]  # steps of this episode so far
-    total: Float[Array, ""]  # its rewards so far
+    episode_return: Float[Array, ""]  # undiscounted, so far
 
 
 class Episode(NamedTuple):
-    """What an environment step says of episodes; the other fields count where `done`."""
+    """What an environment step reports of its episode; the other fields count only where `done`."""
 
     done: Bool[Array, "*batch"]
-    total: Float[Array, "*batch"]  # undiscounted return
+    episode_return: Float[Array, "*batch"]  # undiscounted
     length: Int[Array, "*batch"]
     success: Bool[Array, "*batch"]
 
@@ -54,7 +54,7 @@ def _strong(actor: ActorState) -> ActorState:
 
 
 def first(agent: Agent, spec: Spec, task_state: Any, obs: Float[Array, " obs"]) -> ActorState:
-    """The first moment of an episode: no reward, no action before it, an empty memory."""
+    """The first timestep of an episode: no reward, no action before it, an empty memory."""
     step = Timestep(
         obs=obs,
         reward=jnp.array(0.0),
@@ -70,15 +70,15 @@ def begin(agent: Agent, task: Task, key: Key[Array, ""]) -> ActorState:
     return first(agent, task.spec, *task.reset(key))
 
 
-def moment(agent: Agent, actor: ActorState) -> StoredTimestep:
-    """A moment as the replay keeps it; its values are of no account, its shapes are."""
+def stored(agent: Agent, actor: ActorState) -> StoredTimestep:
+    """A timestep as the replay stores it; only shapes and types matter."""
     return StoredTimestep(actor.step, agent.note(actor.memory))
 
 
 def act(
     agent: Agent, state: Any, actor: ActorState, key: Key[Array, ""], explore: Bool[Array, ""]
 ) -> tuple[Float[Array, " action"], Any]:
-    """The action at the moment in hand, and the memory that has perceived it; `key` is that of `move`."""
+    """The action at the current timestep, and the memory after it; `key` is that of `move`."""
     key_act, _ = jax.random.split(key)
     return agent.act(state, actor.memory, actor.step, key_act, explore)
 
@@ -92,21 +92,21 @@ def arrive(
     reward: Float[Array, ""],
     terminated: Bool[Array, ""],
 ) -> ActorState:
-    """The next moment, terminal or not; its memory is of the one before."""
+    """The next timestep, terminal or not, with the memory after the one before it."""
     step = Timestep(obs, reward, action, jnp.array(False), terminated)
-    return _strong(ActorState(task_state, step, memory, actor.length + 1, actor.total + reward))
+    return _strong(ActorState(task_state, step, memory, actor.length + 1, actor.episode_return + reward))
 
 
 def move(
     agent: Agent, task: Task, state: Any, actor: ActorState, key: Key[Array, ""], explore: Bool[Array, ""]
 ) -> tuple[ActorState, Episode]:
-    """Act and step; returns the actor at the next moment."""
+    """Act and step; returns the actor at the next timestep."""
     action, memory = act(agent, state, actor, key, explore)
     _, key_task = jax.random.split(key)
     task_state, obs, reward, terminated = task.step(actor.task_state, action, key_task)
     after = arrive(actor, memory, action, task_state, obs, reward, terminated)
     done = terminated | (after.length >= task.spec.max_steps)
-    return after, Episode(done, after.total, after.length, task.success(task_state))
+    return after, Episode(done, after.episode_return, after.length, task.success(task_state))
 
 
 def record(
@@ -119,7 +119,7 @@ def record(
     done: Bool[Array, ""],
     key: Key[Array, ""],
 ) -> tuple[ActorState, Replay]:
-    """Keep the moment that was in hand, and the one `after` it where it is the last; returns what is in hand now."""
+    """Store the current timestep, and `after` where it is the last; returns the actor at the new current one."""
     replay = ring.add(replay, StoredTimestep(actor.step, agent.note(after.memory)))
     # Only its note is used: where that needs no action, XLA drops the acting.
     _, last = agent.act(state, after.memory, after.step, key, jnp.array(True))
@@ -140,15 +140,15 @@ def advance(
 def refresh(
     agent: Agent, spec: Spec, state: Any, actor: ActorState, replay: Replay, key: Key[Array, ""], length: int
 ) -> tuple[ActorState, Replay]:
-    """Perceive the first `length` moments of the replay again with networks that have changed since.
+    """Perceive the first `length` timesteps of the replay again, with networks that have changed since.
 
     Returns the actor with the memory it would have now, and the replay with new notes.
     """
     steps, exists = ring.history(replay, length)
     empty = agent.reset(spec)
 
-    def perceive(memory, moment):
-        step, exists, key = moment
+    def perceive(memory, inputs):
+        step, exists, key = inputs
         before = jax.tree.map(lambda new, old: jnp.where(step.is_first, new, old), empty, memory)
         _, after = agent.act(state, before, step, key, jnp.array(True))
         memory = jax.tree.map(lambda new, old: jnp.where(exists, new, old), after, memory)
@@ -160,9 +160,9 @@ def refresh(
 
 
 def evaluate(agent: Agent, task: Task, state: Any, key: Key[Array, ""], explore: Bool[Array, " episodes"]) -> Episode:
-    """Whole episodes side by side, apart from training; leaves (episodes,).
+    """Whole episodes in parallel, apart from training; leaves (episodes,).
 
-    `explore` tells for each episode whether actions are sampled or the policy's mode.
+    `explore` says of each episode whether actions are sampled; else they are the policy's mode.
     """
     key_reset, key_steps = jax.random.split(key)
     episodes = explore.shape[0]

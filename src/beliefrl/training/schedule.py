@@ -1,9 +1,10 @@
 """Training from the first step to the last, on the host: which phase is called when.
 
-The loop is Python over compiled stretches (`phases`); nothing is called back from inside a compiled function. `stages`
-yields what happens, `train` records it in a run's folder.
+The loop is Python over compiled stretches (`phases`); a compiled function never calls back. `stages` yields what
+happens, `train` records it in a run's folder.
 """
 
+import enum
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -21,7 +22,7 @@ from beliefrl.types import UserError
 
 
 class TrainingProgress(NamedTuple):
-    """How far a training is; with all its arrays, what is needed to go on."""
+    """How far a training is; with all its arrays, all that is needed to go on."""
 
     step: int = 0
     pretrained: int = 0  # updates of the pre-training
@@ -30,24 +31,53 @@ class TrainingProgress(NamedTuple):
 
 
 class Snapshot(NamedTuple):
-    """A training between two stretches; its arrays are used up when the next one begins."""
+    """A training between two stretches; the next stretch takes over the memory of its arrays."""
 
     progress: TrainingProgress
     seeds: SeedState
 
 
+class Phase(enum.StrEnum):
+    """What a training does; the values are what is shown."""
+
+    STARTING = "starting"
+    RESUMING = "resuming"
+    MAKING_ENVIRONMENTS = "making the environments"
+    COMPILING_AGENT = "compiling the agent"
+    COMPILING_EXPLORATION = "compiling the exploration"
+    EXPLORING = "exploring"
+    COMPILING_PRETRAINING = "compiling the pre-training"
+    PRETRAINING = "pre-training"
+    COMPILING_LEARNING = "compiling the learning"
+    LEARNING = "learning"
+    EVALUATING = "evaluating"
+    TRAINING = "training"  # whichever of these: a note comes from another thread
+    FAULT = "stopped by a fault"
+    FINISHED = "finished"
+
+    @property
+    def is_compiling(self) -> bool:
+        """Whether nothing but a compilation happens."""
+        return self in (
+            Phase.COMPILING_AGENT,
+            Phase.COMPILING_EXPLORATION,
+            Phase.COMPILING_PRETRAINING,
+            Phase.COMPILING_LEARNING,
+        )
+
+
 class Event(NamedTuple):
     """What has just happened in a training; fields beyond the first three only where they apply."""
 
-    doing: str  # what comes next, in words
+    phase: Phase  # what comes next
     step: int  # environment steps of each seed so far
     metrics: Metrics = {}  # leaves (seed,): means over the last stretch
     episodes: Episode | None = None  # leaves (seed, stretch)
     evaluation: Episode | None = None  # leaves (seed, mode, episodes)
-    states: Any = None  # the agents, where they are to be saved
+    states: Any = None  # the agents, where they should be saved
     part: tuple[int, int] | None = None  # of the pre-training: updates done, of how many
-    snapshot: Snapshot | None = None  # where a training can be left, and gone on from
-    note: str | None = None  # something else that the user should know, a sentence
+    snapshot: Snapshot | None = None  # where a training can stop and be resumed
+    note: str | None = None  # another message for the user, a sentence
 
 
 def stages(
@@ -55,16 +85,18 @@ def stages(
     task: Task | GymnasiumTask,
     options: Options,
     restore: Callable[[SeedState], Snapshot] | None = None,
-    tell: Callable[[str], None] | None = None,
+    notify: Callable[[str], None] | None = None,
+    own_process: bool = False,
 ) -> Iterator[Event]:
-    """Train; yields an Event before whatever takes long and after whatever gave something to tell.
+    """Train; yields an Event before whatever takes long and after whatever has results.
 
     Args:
-        agent: what learns.
-        task: on what.
-        options: how long.
-        restore: is given the shapes of a training's arrays, and returns those to go on from.
-        tell: is called by another thread with what cannot wait for the next Event, a sentence.
+        agent: the agent to train.
+        task: the task to train it on.
+        options: how long, how often, and how it is evaluated.
+        restore: given the shapes of a training's arrays, returns the snapshot to go on from.
+        notify: called from another thread with a sentence that cannot wait for the next Event.
+        own_process: as in `train`.
 
     Raises:
         Fault: of a Gymnasium environment, after an Event with what was learned until then.
@@ -72,14 +104,17 @@ def stages(
     numbers = range(options.seed, options.seed + options.seeds)
     sizes = capacity(agent, options), options.eval_episodes
     if isinstance(task, GymnasiumTask):
-        yield Event("making the environments", 0)
-        program = host_loop.program(agent, task, *sizes, numbers, options.processes, tell)
+        yield Event(Phase.MAKING_ENVIRONMENTS, 0)
+        if own_process:
+            host_loop.keep_memory()
+        processes = options.processes if own_process or options.processes == "always" else "never"
+        program = host_loop.program(agent, task, *sizes, numbers, processes, notify)
     else:
         program = phases.compile_program(agent, task, *sizes)
     keys = jax.vmap(jax.random.key)(np.array(numbers))
     try:
         if restore is None:
-            yield Event("compiling the agent", 0)
+            yield Event(Phase.COMPILING_AGENT, 0)
             start = Snapshot(TrainingProgress(), program.begin(keys))
         else:
             at, seeds = restore(program.shapes(keys))
@@ -87,9 +122,9 @@ def stages(
         yield from _stages(agent, program, options, *start)
     except Fault as fault:
         if fault.seeds is not None:
-            metrics, episodes = fault.told or ({}, None)
+            metrics, episodes = fault.stretch or ({}, None)
             learned = fault.seeds.state if fault.step >= agent.step_start_rl else None
-            yield Event("stopped by a fault", fault.step, metrics, episodes, states=learned)
+            yield Event(Phase.FAULT, fault.step, metrics, episodes, states=learned)
         raise
     finally:
         program.close()
@@ -102,54 +137,54 @@ def _stages(
     stretch = phases.stretch_length(agent)
 
     if at.step < explored:
-        yield Event("compiling the exploration", at.step)
+        yield Event(Phase.COMPILING_EXPLORATION, at.step)
         seeds, _ = program.explore(seeds, at.step, 0)
-        yield Event("exploring", at.step)
+        yield Event(Phase.EXPLORING, at.step)
     while at.step < explored:
         steps = min(stretch, explored - at.step, _until(at.step, options.eval_every))
-        seeds, told = program.explore(seeds, at.step, steps)
+        seeds, log = program.explore(seeds, at.step, steps)
         at = at._replace(step=at.step + steps)
-        yield Event("exploring", at.step, episodes=told.episodes)
+        yield Event(Phase.EXPLORING, at.step, episodes=log.episodes)
         if at.step % options.eval_every == 0:
-            yield from _evaluation(program, seeds, at.step, "exploring")
+            yield from _evaluation(program, seeds, at.step, Phase.EXPLORING)
             at = at._replace(evaluated=at.step)
-        yield Event("exploring", at.step, snapshot=Snapshot(at, seeds))
+        yield Event(Phase.EXPLORING, at.step, snapshot=Snapshot(at, seeds))
 
     if at.step < options.steps and agent.pretrain_updates and not at.refreshed:
         if at.pretrained < agent.pretrain_updates:
-            yield Event("compiling the pre-training", at.step)
+            yield Event(Phase.COMPILING_PRETRAINING, at.step)
             seeds, _ = program.pretrain(seeds, at.pretrained, 0)
-            yield Event("pre-training", at.step)
+            yield Event(Phase.PRETRAINING, at.step)
         while at.pretrained < agent.pretrain_updates:
             updates = min(stretch, agent.pretrain_updates - at.pretrained)
             seeds, metrics = program.pretrain(seeds, at.pretrained, updates)
             at = at._replace(pretrained=at.pretrained + updates)
-            told = {f"pretrain_{name}": mean for name, mean in metrics.items()}
+            means = {f"pretrain_{name}": mean for name, mean in metrics.items()}
             part = at.pretrained, agent.pretrain_updates
-            yield Event("pre-training", at.step, told, part=part, snapshot=Snapshot(at, seeds))
+            yield Event(Phase.PRETRAINING, at.step, means, part=part, snapshot=Snapshot(at, seeds))
         seeds, at = program.refresh(seeds), at._replace(refreshed=True)
 
     if at.step < options.steps:
-        yield Event("compiling the learning", at.step)
+        yield Event(Phase.COMPILING_LEARNING, at.step)
         seeds, _ = program.learn(seeds, at.step, 0)
-        yield Event("learning", at.step)
+        yield Event(Phase.LEARNING, at.step)
     while at.step < options.steps:
         until = min(options.steps - at.step, _until(at.step, options.eval_every))
         cycles = min(-(-until // agent.cycle), stretch // agent.cycle)
-        seeds, told = program.learn(seeds, at.step, cycles)
+        seeds, log = program.learn(seeds, at.step, cycles)
         before, at = at.step, at._replace(step=at.step + cycles * agent.cycle)
-        yield Event("learning", at.step, told.metrics, told.episodes)
+        yield Event(Phase.LEARNING, at.step, log.metrics, log.episodes)
         if at.step // options.eval_every > before // options.eval_every:
-            yield from _evaluation(program, seeds, at.step, "learning")
+            yield from _evaluation(program, seeds, at.step, Phase.LEARNING)
             at = at._replace(evaluated=at.step)
-        yield Event("learning", at.step, snapshot=Snapshot(at, seeds))
+        yield Event(Phase.LEARNING, at.step, snapshot=Snapshot(at, seeds))
     if at.evaluated < at.step:
-        yield from _evaluation(program, seeds, at.step, "learning")
-        yield Event("finished", at.step, snapshot=Snapshot(at._replace(evaluated=at.step), seeds))
+        yield from _evaluation(program, seeds, at.step, Phase.LEARNING)
+        yield Event(Phase.FINISHED, at.step, snapshot=Snapshot(at._replace(evaluated=at.step), seeds))
 
 
 def capacity(agent: Agent, options: Options) -> int:
-    """Moments in a seed's replay: no more than can come, a moment a step and one more where an episode ends."""
+    """Timesteps in a seed's replay: no more than can come, one per step and one more where an episode ends."""
     if options.steps > agent.step_start_rl:
         needed = max(2 * agent.step_start_rl, agent.window.length + 1)  # `refresh` wants all of the exploration
         if options.replay_capacity < needed:
@@ -164,12 +199,12 @@ def _until(step: int, every: int) -> int:
     return every - step % every
 
 
-def _evaluation(program: Program, seeds: SeedState, step: int, doing: str) -> Iterator[Event]:
-    yield Event("evaluating", step)
+def _evaluation(program: Program, seeds: SeedState, step: int, then: Phase) -> Iterator[Event]:
+    yield Event(Phase.EVALUATING, step)
     keys = jax.vmap(lambda key: jax.random.fold_in(jax.random.fold_in(key, phases.EVALUATE), step))(seeds.key)
     try:
         result = program.evaluate(seeds.state, keys)
     except Fault as fault:
         fault.seeds, fault.step = seeds, step
         raise
-    yield Event(doing, step, evaluation=result, states=seeds.state)
+    yield Event(then, step, evaluation=result, states=seeds.state)

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: the first is a request, the second leaves at once."""
+"""Ctrl-C and SIGTERM: the first asks a training to stop, the second ends the program at once."""
 
 import contextlib
 import os
@@ -11,11 +11,11 @@ from types import FrameType
 from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-ONE_REQUEST = 0.3  # seconds in which several are one: a parent that dies may send one for each of its threads
+ONE_REQUEST = 0.3  # seconds in which several signals count as one: a parent that dies may send one per thread
 
 
 class Stopped(KeyboardInterrupt):
-    """A training was left at somebody's request; its message says how to go on."""
+    """A training was stopped by a signal; its message says how to go on."""
 
     def __init__(self, message: str, number: int):
         super().__init__(message)
@@ -23,22 +23,22 @@ class Stopped(KeyboardInterrupt):
 
 
 class Requests:
-    """While entered, the first signal is kept in `number`; a later one ends the program in that moment.
+    """While entered, the first signal is kept in `number`; a later one ends the program at once.
 
-    Python runs handlers between two of its own instructions, so one that comes while a compiled function runs waits
-    for it. A thread is therefore told of each signal by the system at once: it answers the first, and the second ends
-    the program.
+    Python runs handlers between two of its own instructions, so a signal during a compiled function waits until that
+    returns. The system therefore also writes each signal to a socket at once. A thread reads it: it confirms the first
+    signal and ends the program at the second.
     """
 
-    def __init__(self, answer: Callable[[], None] = lambda: None):
-        """`answer` is called once, by that thread, at the first signal."""
+    def __init__(self, confirm: Callable[[], None] = lambda: None):
+        """`confirm` is called once, by that thread, at the first signal."""
         self.number: int | None = None
-        self._answer = answer
+        self._confirm = confirm
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> "Requests":
         if threading.current_thread() is not threading.main_thread():
-            return self  # only there can signals be handled
+            return self  # Python handles signals there only
         self._ours, theirs = socket.socketpair()
         theirs.setblocking(False)
         self._theirs = theirs
@@ -64,12 +64,12 @@ class Requests:
     def _watch(self, ours: socket.socket) -> None:
         first = None
         with ours:
-            while told := ours.recv(1):
-                if told[0] in SIGNALS:
+            while received := ours.recv(1):
+                if received[0] in SIGNALS:
                     now = time.monotonic()
                     if first is None:
                         first = now
-                        with contextlib.suppress(Exception):  # the second signal must be heard all the same
-                            self._answer()
+                        with contextlib.suppress(Exception):  # an error of `confirm` must not stop the thread
+                            self._confirm()
                     elif now - first > ONE_REQUEST:
-                        os._exit(128 + told[0])
+                        os._exit(128 + received[0])

@@ -1,6 +1,6 @@
-"""A training and what it leaves: its folder, log and checkpoints; how it is stopped, gone on with, and ended.
+"""Train an agent and record it: the run's folder, its log and checkpoints; stopping and resuming.
 
-`schedule.stages` does the training and yields what happens; everything here listens.
+`schedule.stages` trains and yields events; the code here records them.
 """
 
 import contextlib
@@ -28,11 +28,12 @@ from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import log
 from beliefrl.training.evaluation import agent_of, task_of, tuples
 from beliefrl.training.phases import SeedState
-from beliefrl.training.schedule import Event, Options, Snapshot, TrainingProgress, capacity, stages
+from beliefrl.training.schedule import Event, Options, Phase, Snapshot, TrainingProgress, capacity, stages
 from beliefrl.training.stop import Requests, Stopped
 from beliefrl.types import UserError
 
 Report = Callable[[Event], None]
+RENAMED = {".actor.episode_return": ".actor.total"}  # arrays in checkpoints: the present name, the old one
 
 
 def train(
@@ -40,6 +41,7 @@ def train(
     task: Task | GymnasiumTask | str,
     out: str | os.PathLike[str] | None = None,
     report: Report | None = None,
+    own_process: bool = False,
     **options: Any,
 ) -> Run:
     """Train an agent on a task and record it in a folder.
@@ -49,7 +51,10 @@ def train(
         task: a task, or the name of one.
         out: the run's folder; None is runs/AGENT-TASK-1, or the next free number. It must not exist, unless it is empty
             or a training left it that ended before it saved an agent or a checkpoint; then it is used again.
-        report: called with every Event as it happens, for progress. Notes that cannot wait come from another thread.
+        report: called with every Event as it happens, to show progress. Urgent notes come from another thread.
+        own_process: True says that this process only trains, and that it guards its main module (`if __name__ == ...`).
+            Then processes="auto" may start processes, and training on a Gymnasium environment lets the C library keep
+            freed memory. The command line says so.
         options: the fields of `Options`: steps, seeds, seed, eval_every, eval_episodes, replay_capacity, processes,
             checkpoint_steps, checkpoint_minutes, keep_checkpoints, precision, track.
 
@@ -58,8 +63,7 @@ def train(
 
     Raises:
         UserError: an unknown name or option, an impossible value, `out` exists, a tracker cannot be opened, the disk is
-            full, or a Gymnasium environment did what none may do; then what was learned and logged until that step is
-            saved.
+            full, or a Gymnasium environment is faulty; then what was learned and logged until that step is saved.
         Stopped: Ctrl-C or SIGTERM, once a checkpoint is written; `resume` goes on. It is a KeyboardInterrupt.
     """
     agent = agents.make(agent) if isinstance(agent, str) else agent
@@ -69,7 +73,7 @@ def train(
         if name not in known:
             raise UserError(f"Training has no option {name!r}: it has {', '.join(known)}.")
     chosen = Options(**options)
-    _ = capacity(agent, chosen), made.spec, trackers.check(chosen.track)  # complain before there is a folder
+    _ = capacity(agent, chosen), made.spec, trackers.check(chosen.track)  # raise before the folder is made
     config = {
         "agent": agents.name_of(agent),
         "hyperparameters": dataclasses.asdict(agent),  # pyright: ignore[reportArgumentType]
@@ -78,7 +82,7 @@ def train(
         **provenance(),
     }
     recorder = Recorder(out or free_folder(f"{config['agent']}-{config['task']}"), config)
-    return _Training(recorder, agent, made, chosen, report).run()
+    return _Training(recorder, agent, made, chosen, report, own_process).run()
 
 
 def resume(
@@ -86,6 +90,7 @@ def resume(
     steps: int | None = None,
     task: Task | GymnasiumTask | None = None,
     report: Report | None = None,
+    own_process: bool = False,
 ) -> Run:
     """Go on with a training from its last checkpoint.
 
@@ -97,7 +102,7 @@ def resume(
         run: a run, or its folder.
         steps: train for so many environment steps in all; None: as many as before. They may only grow.
         task: needed only where the run was trained on a task of your own.
-        report: as in `train`.
+        report, own_process: as in `train`.
 
     Raises:
         UserError: there is no such run, none of its checkpoints is good or left, another process trains it, or `steps`
@@ -118,7 +123,7 @@ def resume(
         options = dataclasses.replace(Options(**before), **({} if steps is None else {"steps": steps}))
         trackers.check(options.track)
         recorder.amend({"options": dataclasses.asdict(options)}, provenance())
-        training = _Training(recorder, agent, made, options, report)
+        training = _Training(recorder, agent, made, options, report, own_process)
         if begins_again:
             training.begin_again()
         stack.pop_all()
@@ -126,7 +131,7 @@ def resume(
 
 
 def _options(run: Run) -> dict[str, Any]:
-    """With which a run was trained."""
+    """The options that a run was trained with."""
     known = {field.name for field in dataclasses.fields(Options)}
     for name in run.config["options"]:
         if name not in known:
@@ -135,10 +140,19 @@ def _options(run: Run) -> dict[str, Any]:
 
 
 class _Training:
-    """One training as it is being recorded."""
+    """One training while it runs."""
 
-    def __init__(self, recorder: Recorder, agent: Agent, task: Any, options: Options, report: Report | None):
+    def __init__(
+        self,
+        recorder: Recorder,
+        agent: Agent,
+        task: Any,
+        options: Options,
+        report: Report | None,
+        own_process: bool,
+    ):
         self.recorder, self.agent, self.task, self.options = recorder, agent, task, options
+        self.own_process = own_process
         self.report = report or (lambda event: None)
         self.has_success = task.spec.has_success
         self.checkpoints = Checkpoints(recorder.folder, options.keep_checkpoints)
@@ -149,15 +163,15 @@ class _Training:
         self.requests = Requests(partial(self._note, "stopping after this stretch; Ctrl-C again ends at once"))
 
     def run(self, restore: Callable[[SeedState], Snapshot] | None = None) -> Run:
-        """To the end, or until it is stopped."""
+        """Train to the end, or until a signal."""
         try:
             with self.recorder, jax.default_matmul_precision(self.options.precision):
                 self._train(restore)
-        except BrokenPipeError:  # whoever was reading the reports has gone
+        except BrokenPipeError:  # the reader of the output has closed it
             raise
         except OSError as error:
             raise UserError(
-                f"{self.recorder.folder} cannot be written ({error.strerror}): mend that, then "
+                f"{self.recorder.folder} cannot be written ({error.strerror}): fix that, then "
                 f"`beliefrl resume {self.recorder.folder}` goes on."
             ) from None
         return self.recorder
@@ -165,7 +179,7 @@ class _Training:
     def _train(self, restore: Callable[[SeedState], Snapshot] | None) -> None:
         try:
             with self.checkpoints, self.requests:
-                for event in stages(self.agent, self.task, self.options, restore, self._note):
+                for event in stages(self.agent, self.task, self.options, restore, self._note, self.own_process):
                     self._listen(event)
             self.recorder.finish(self.results or {})
             draw_curve(self.recorder)
@@ -173,23 +187,23 @@ class _Training:
             self.recorder.note_end()
 
     def begin_again(self) -> None:
-        """Forget what was logged: there is nothing to go on from."""
+        """Clear the log and begin at step 0, for want of a checkpoint."""
         self.recorder.rewind(dict.fromkeys(self.recorder.seeds, 0))
         self._note("no checkpoint was written: begins again from step 0")
 
     def restore(self, shapes: SeedState) -> Snapshot:
-        """From the last good checkpoint; the log is cut back to what it was then."""
+        """Restore the last undamaged checkpoint, and truncate the log to its length at that time."""
         ring = shapes.replay
         like = shapes._replace(replay=ring._replace(moments=()))
-        found = self.checkpoints.restore(like, ring.moments)
+        found = self.checkpoints.restore(like, ring.moments, RENAMED)
         for why in found.passed_over:
-            self.report(Event("resuming", found.step, note=f"{why} The checkpoint before it is used."))
+            self.report(Event(Phase.RESUMING, found.step, note=f"{why} The checkpoint before it is used."))
         self.recorder.rewind({int(seed): length for seed, length in found.progress["metrics"].items()})
         self.last, self.lost = TrainingProgress(*found.progress["progress"]), set(found.progress["lost"])
-        self.report(Event("resuming", found.step, note=f"goes on from the checkpoint of step {found.step:,}"))
+        self.report(Event(Phase.RESUMING, found.step, note=f"goes on from the checkpoint of step {found.step:,}"))
         if isinstance(self.task, GymnasiumTask):
-            self.report(Event("resuming", found.step, note="a new episode begins: an environment cannot be saved"))
-        seeds = found.tree._replace(replay=found.tree.replay._replace(moments=found.moments))
+            self.report(Event(Phase.RESUMING, found.step, note="a new episode begins: an environment cannot be saved"))
+        seeds = found.tree._replace(replay=found.tree.replay._replace(moments=found.timesteps))
         return Snapshot(self.last, jax.tree.map(jnp.asarray, seeds))
 
     def _listen(self, event: Event) -> None:
@@ -205,11 +219,11 @@ class _Training:
             self._consider(event.snapshot)
 
     def _note(self, note: str) -> None:
-        """Tell the user something at once, whichever thread it comes from."""
-        self.report(Event("training", self.step, note=note))
+        """Report a note at once, from any thread."""
+        self.report(Event(Phase.TRAINING, self.step, note=note))
 
     def _look_for_divergence(self, event: Event) -> None:
-        """A seed whose losses or networks are not finite any more is lost; the others go on."""
+        """Drop seeds whose losses or networks are no longer finite; the others go on."""
         for name, values in event.metrics.items():
             self._lose(np.flatnonzero(~np.isfinite(values)), event, f"{name} is not finite")
         states = event.states
@@ -230,10 +244,10 @@ class _Training:
             note = f"seed {seed} diverged by step {event.step:,}: {why}; {where}."
             if len(self.lost) == len(self.recorder.seeds):
                 raise UserError(f"All seeds have diverged; {note} Try smaller learning rates.")
-            self.report(Event(event.doing, event.step, note=note))
+            self.report(Event(event.phase, event.step, note=note))
 
     def _is_due(self, snapshot: Snapshot) -> bool:
-        """Whether it is time for a checkpoint."""
+        """Whether a checkpoint is due."""
         progress, options = snapshot.progress, self.options
         steps = progress.step - self.last.step >= options.checkpoint_steps > 0
         minutes = time.monotonic() - self.saved_at >= 60 * options.checkpoint_minutes > 0
@@ -244,12 +258,12 @@ class _Training:
         return progress.step >= self.options.steps and progress.evaluated == progress.step
 
     def _consider(self, snapshot: Snapshot) -> None:
-        """Write a checkpoint if it is time for one; leave if that was asked for."""
+        """Write a checkpoint if one is due; stop if a signal asked for it."""
         if not self._is_due(snapshot):
             return
         progress, asked = snapshot.progress, self.requests.number
         if progress.refreshed and not self.last.refreshed:
-            self.checkpoints.forget_moments()
+            self.checkpoints.forget_timesteps()
         self._save(snapshot)
         if asked and not self._has_ended(progress):
             self.checkpoints.wait()
