@@ -19,7 +19,7 @@ def build(agent: Any, hyperparameters: Mapping[str, Any], name: str | None = Non
     Raises:
         UserError: it has no such hyperparameter, lacks one that has no default, or a value is impossible.
     """
-    kind: Any = agent if isinstance(agent, type) else type(agent)
+    kind = agent if isinstance(agent, type) else type(agent)
     name = name or path(kind)
     known = [field.name for field in dataclasses.fields(kind) if field.init]
     for given in hyperparameters:
@@ -30,7 +30,7 @@ def build(agent: Any, hyperparameters: Mapping[str, Any], name: str | None = Non
     if agent is kind:
         for missing in _required(kind) - set(hyperparameters):
             raise UserError(f"The agent {name} has no default for {missing}: give that field one.")
-    make = kind if agent is kind else functools.partial(dataclasses.replace, agent)
+    make: Any = agent if isinstance(agent, type) else functools.partial(dataclasses.replace, agent)
     try:
         return make(**hyperparameters)
     except UserError:

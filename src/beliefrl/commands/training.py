@@ -95,11 +95,12 @@ def _ended(run: Any) -> None:
     from rich.console import Console
 
     from beliefrl.commands.display import results_table
+    from beliefrl.training.evaluation import as_argument
 
     console, results = Console(), run.results() or {}
     title = f"{run.config['agent']} on {run.config['task']} after {results['step']:,} steps"
     console.print(results_table(results, run.seeds, title))
-    told = f"saved in {run.folder}: see curve.png; `beliefrl evaluate {run.folder}` plays more episodes"
+    told = f"saved in {run.folder}: see curve.png; `beliefrl evaluate {as_argument(run)}` plays more episodes"
     console.print(told, markup=False, highlight=False, soft_wrap=True)
 
 

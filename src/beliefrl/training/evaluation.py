@@ -106,6 +106,12 @@ def agent_of(run: Run, agent: Agent | type | None = None) -> Agent:
         return hyperparameters.restored(like, run.config["hyperparameters"])
 
 
+def as_argument(run: Run) -> str:
+    """How commands take a run: its folder, and --agent where an agent of a user's was trained."""
+    name = run.config["agent"]
+    return f"{run.folder} --agent {one_line(name)}" if agents.is_own(name) else str(run.folder)
+
+
 def task_of(run: Run | str | os.PathLike[str]) -> Any:
     """The task that a run was trained on, as `make_task` makes it; a `gym:PACKAGE:ID` imports its package.
 

@@ -26,7 +26,7 @@ from beliefrl.runs.run import Recorder, Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import log
-from beliefrl.training.evaluation import agent_of, task_of, tuples
+from beliefrl.training.evaluation import agent_of, as_argument, task_of, tuples
 from beliefrl.training.phases import SeedState
 from beliefrl.training.schedule import Event, Options, Snapshot, TrainingProgress, capacity, stages
 from beliefrl.training.stop import Requests, Stopped
@@ -160,7 +160,7 @@ class _Training:
         except OSError as error:
             raise UserError(
                 f"{self.recorder.folder} cannot be written ({error.strerror}): mend that, then "
-                f"`beliefrl resume {self.recorder.folder}` goes on."
+                f"`beliefrl resume {as_argument(self.recorder)}` goes on."
             ) from None
         return self.recorder
 
@@ -253,8 +253,8 @@ class _Training:
         self._save(snapshot)
         if asked and not self._has_ended(progress):
             self.checkpoints.wait()
-            folder = self.recorder.folder
-            raise Stopped(f"stopped at step {progress.step:,}; `beliefrl resume {folder}` goes on from there.", asked)
+            run = as_argument(self.recorder)
+            raise Stopped(f"stopped at step {progress.step:,}; `beliefrl resume {run}` goes on from there.", asked)
 
     def _save(self, snapshot: Snapshot) -> None:
         replay = snapshot.seeds.replay
