@@ -11,7 +11,7 @@ from beliefrl.agents import hyperparameters
 from beliefrl.agents.sac_mlp import SACMLPAgent
 from beliefrl.agents.vrm import VRMAgent
 from beliefrl.types import UserError
-from worlds import Counting, CountingAgent, installed
+from worlds import CountingAgent, installed
 
 OWN = "worlds:CountingAgent"
 
@@ -49,7 +49,7 @@ class Demanding(CountingAgent):
 
 
 @dataclasses.dataclass
-class Thawed(Counting):
+class Thawed:
     pass
 
 

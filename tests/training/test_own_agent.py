@@ -77,7 +77,9 @@ def readers(run, tmp_path):
 
 def test_without_it_one_sentence_says_what_to_give(run, tmp_path):
     for read in readers(run, tmp_path):
-        with pytest.raises(UserError, match=r"was trained by \S+:Foreteller: give --agent \S+:Foreteller, or in Python"):
+        with pytest.raises(
+            UserError, match=r"was trained by \S+:Foreteller: give --agent \S+:Foreteller, or in Python"
+        ):
             read()
 
 
