@@ -129,3 +129,11 @@ def main(steps: int = 6_000, seeds: int = 2, out: str = "runs/stack") -> None:
 
 if __name__ == "__main__":
     tyro.cli(main)
+
+# The command line takes it as well, in the folder of this file. Its fields are options.
+#
+#     beliefrl train 03_a_new_agent:StackAgent pendulum-p --stack 4 --steps 6000 --out runs/stack-4
+#     beliefrl resume runs/stack-4 --steps 10000 --agent 03_a_new_agent:StackAgent
+#     beliefrl evaluate runs/stack-4 --agent 03_a_new_agent:StackAgent
+#     beliefrl video runs/stack-4 stack.gif --agent 03_a_new_agent:StackAgent
+#     beliefrl bench 03_a_new_agent:StackAgent

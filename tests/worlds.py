@@ -153,3 +153,13 @@ class CountingAgent:
     def update(self, state, batch, key):
         metrics = self.check(batch)
         return state._replace(seen=state.seen + metrics["valid"].astype(int)), metrics
+
+
+def installed(folder, monkeypatch, group, lines="", **points):
+    """The entry_points.txt of a package that is installed in a folder: NAME=MODULE:CLASS of a group."""
+    info = folder / "some_package-1.0.dist-info"
+    info.mkdir(parents=True)
+    lines += "".join(f"{name.replace('_', '-')} = {value}\n" for name, value in points.items())
+    (info / "entry_points.txt").write_text(f"[{group}]\n{lines}")
+    monkeypatch.syspath_prepend(str(folder))
+    return info / "entry_points.txt"

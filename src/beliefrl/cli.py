@@ -34,9 +34,11 @@ for example
   beliefrl evaluate runs/first --episodes 20
   beliefrl train vrm target-reaching --steps 60000 --gamma 0.98
   beliefrl train vrm gym:MountainCarContinuous-v0 --observe 0 --seeds 2
+  beliefrl train my_module:MyAgent pendulum-p
 
 COMMAND --help shows the options of a command; `beliefrl train AGENT --help` also the agent's hyperparameters,
-with their defaults and where in the paper they stand.
+with their defaults and where in the paper they stand. AGENT is a name that `beliefrl agents` lists, or MODULE:CLASS,
+an agent of your own in this folder or on the Python path. Commands that read its runs need --agent MODULE:CLASS.
 
 A run's folder holds config.json, metrics/ (a line of JSON for every entry), tensorboard/, checkpoints/, the trained
 agents, results.json and curve.png. Ctrl-C writes a checkpoint first. Mistakes end with one sentence and exit code 2.
@@ -64,14 +66,14 @@ def main(argv: Sequence[str] | None = None) -> None:
         hint = f"did you mean {near[0]}?" if near else f"there is {', '.join(COMMANDS)}."
         _fail(f"There is no command {argv[0]!r}: {hint}")
 
-    from beliefrl.types import UserError
+    from beliefrl.types import UserError, one_line
 
     if "" not in sys.path:
-        sys.path.insert(0, "")  # as `python -m` does: finds gym:my_module:MyEnv-v0 in the current folder
+        sys.path.insert(0, "")  # as `python -m` does: finds my_module:MyAgent and gym:my_module:MyEnv-v0 here
     try:
         COMMANDS[argv[0]](argv[1:])
     except (UsageError, UserError) as error:
-        _fail(str(error))
+        _fail(one_line(str(error)))
     except KeyboardInterrupt as stopped:
         what = str(stopped) or "stopped; what was logged and saved stays in the run's folder."
         print(f"beliefrl: {what}", file=sys.stderr)

@@ -180,7 +180,10 @@ class Policy:
 
 
 def load(
-    run: Run | str | os.PathLike[str], seed: int | None = None, task: Task | GymnasiumTask | None = None
+    run: Run | str | os.PathLike[str],
+    seed: int | None = None,
+    task: Task | GymnasiumTask | None = None,
+    agent: Agent | type | None = None,
 ) -> Policy:
     """The policy that a run has learned.
 
@@ -188,14 +191,15 @@ def load(
         run: a run, or its folder.
         seed: which of the run's seeds; None is its first.
         task: needed only where the run was trained on a task of your own.
+        agent: needed only where an agent of your own was trained: its class, or one of them.
 
     Raises:
         UserError: there is no such run, nothing was saved in it, or it has no such seed.
     """
     run = run if isinstance(run, Run) else Run(run)
-    agent, found, state, precision = restore_seed(run, seed, task)
+    trained, found, state, precision = restore_seed(run, seed, task, agent)
     seed = run.seeds[0] if seed is None else seed
-    return Policy(agent, found.spec, state, seed, precision, run.config["task"])
+    return Policy(trained, found.spec, state, seed, precision, run.config["task"])
 
 
 def _numbers(value: Any, name: str) -> np.ndarray:

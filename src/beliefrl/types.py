@@ -85,8 +85,12 @@ def check_indices(indices: Sequence[Any], size: int) -> None:
 
 
 def tuples(values: Mapping[str, Any]) -> dict[str, Any]:
-    """JSON's lists as the tuples that they stand for."""
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+    """JSON's lists, also lists in lists, as the tuples that they stand for."""
+
+    def frozen(value: Any) -> Any:
+        return tuple(map(frozen, value)) if isinstance(value, list) else value
+
+    return {name: frozen(value) for name, value in values.items()}
 
 
 def check_choice(settings: object, name: str, choices: Sequence[str | bool]) -> None:

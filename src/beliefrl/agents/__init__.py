@@ -1,4 +1,4 @@
-"""Agents: what learns. A new agent is one file and one line in `AGENTS`."""
+"""Agents: what learns. A new agent is one file and one line in `AGENTS`, or a class of a user's (`find_class`)."""
 
 import dataclasses
 import difflib
@@ -8,10 +8,12 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from jaxtyping import Array, Bool, Float, Key
 
+from beliefrl.agents.hyperparameters import build
 from beliefrl.agents.sac_lstm import SACLSTMAgent
 from beliefrl.agents.sac_mlp import SACMLPAgent
 from beliefrl.agents.slac import SLACAgent
 from beliefrl.agents.vrm import VRMAgent
+from beliefrl.imports import declared, declared_name, is_named, load, load_declared, path
 from beliefrl.models.nets import Gaussian
 from beliefrl.types import Spec, Timestep, UserError, Window, WindowShape
 
@@ -123,6 +125,7 @@ def _own(agent: type) -> Entry:
     return Entry(agent(), (agent.__doc__ or "").split("\n")[0])
 
 
+GROUP = "beliefrl.agents"  # of entry points
 AGENTS: dict[str, Entry] = {
     "vrm": _own(VRMAgent),
     "sac-mlp": _own(SACMLPAgent),
@@ -138,47 +141,86 @@ AGENTS: dict[str, Entry] = {
 
 
 def names() -> dict[str, str]:
-    """Every agent's name with a sentence on it."""
-    return {name: entry.about for name, entry in AGENTS.items()}
+    """Every agent's name with a sentence on it: ours, then those of installed packages, which are not imported."""
+    return {name: entry.about for name, entry in AGENTS.items()} | {
+        name: f"{value}, of an installed package." for name, value in declared(GROUP, AGENTS).items()
+    }
 
 
 @functools.cache
 def defaults() -> dict[str, dict[str, Any]]:
-    """Every agent's hyperparameters as its name stands for them, as JSON has them."""
+    """The hyperparameters of each of our agents as its name stands for them, as JSON has them."""
     return {name: json.loads(json.dumps(dataclasses.asdict(entry.agent))) for name, entry in AGENTS.items()}
 
 
-def find(name: str) -> Any:
-    """The agent of that name with the hyperparameters that the name stands for.
+def find_class(name: str) -> type:
+    """The class of the agent of that name, which may be `module:Class`: never call it with what only a file says.
 
     Raises:
-        UserError: no agent has that name.
+        UserError: no agent has that name, or the class is no agent.
     """
-    if name not in AGENTS:
-        near = difflib.get_close_matches(name, AGENTS, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"there is {', '.join(AGENTS)}."
-        raise UserError(f"There is no agent {name!r}: {hint}")
-    return AGENTS[name].agent
+    if name in AGENTS:
+        return type(AGENTS[name].agent)
+    if is_own(name):
+        return check_class(load(name))
+    theirs = declared(GROUP, AGENTS)
+    if name in theirs:
+        return check_class(load_declared(GROUP, name, theirs[name]))
+    near = difflib.get_close_matches(name, [*AGENTS, *theirs], n=1)
+    there = ", ".join([*AGENTS, *theirs])
+    hint = f"did you mean {near[0]}?" if near else f"there is {there}, and MODULE:CLASS for one of your own."
+    raise UserError(f"There is no agent {name!r}: {hint}")
+
+
+def check_class(kind: type) -> type:
+    """The same class, once it is sure to be one of agents.
+
+    Raises:
+        UserError: it is no frozen dataclass, or lacks something that an agent has.
+    """
+    parameters = getattr(kind, "__dataclass_params__", None)
+    if not (dataclasses.is_dataclass(kind) and parameters is not None and parameters.frozen):
+        raise UserError(f"{path(kind)} is no agent: make it a frozen dataclass, @dataclasses.dataclass(frozen=True).")
+    has = {field.name for field in dataclasses.fields(kind)} | set(dir(kind))
+    lacks = [name for name in vars(Agent) if not name.startswith("_") and name not in has]
+    if lacks:
+        raise UserError(f"{path(kind)} is no agent: it lacks {', '.join(lacks)} (see beliefrl.Agent).")
+    return kind
+
+
+def find(name: str) -> Any:
+    """The agent of that name with the hyperparameters that the name stands for; see `find_class`.
+
+    Raises:
+        UserError: no agent has that name, or the class is no agent or has a hyperparameter without a default.
+    """
+    agent = named(name)
+    return build(agent, {}, name) if isinstance(agent, type) else agent
 
 
 def make(name: str, /, **hyperparameters: Any) -> Agent:
     """The agent of that name; `hyperparameters` replace its defaults.
 
+    Args:
+        name: of one of ours or of an installed package, or `module:Class` for an agent of your own, which is imported.
+
     Raises:
         UserError: no agent has that name, it has no such hyperparameter, or a value is impossible.
     """
-    agent = find(name)
-    known = [field.name for field in dataclasses.fields(agent)]
-    for given in hyperparameters:
-        if given not in known:
-            near = difflib.get_close_matches(given, known, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"it has {', '.join(known)}."
-            raise UserError(f"The agent {name} has no hyperparameter {given!r}: {hint}")
-    return dataclasses.replace(agent, **hyperparameters)
+    return build(named(name), hyperparameters, name)
+
+
+def named(name: str) -> Any:
+    """What a name stands for: of ours an agent with the hyperparameters of that name, of others the class.
+
+    Raises:
+        UserError: as `find_class`.
+    """
+    return AGENTS[name].agent if name in AGENTS else find_class(name)
 
 
 def name_of(agent: Agent) -> str:
-    """The name under which `make` finds an agent; module:Class for one that is not in this library.
+    """The name under which `make` finds an agent; module:Class for one that is neither ours nor of an entry point.
 
     Of names that share a class (the ablations) it is the one whose own settings the agent has.
     """
@@ -188,4 +230,16 @@ def name_of(agent: Agent) -> str:
             own = [field.name for field in dataclasses.fields(known) if getattr(known, field.name) != field.default]
             if all(getattr(agent, field) == getattr(known, field) for field in own):
                 found = name
-    return found or f"{type(agent).__module__}:{type(agent).__qualname__}"
+    return found or declared_name(GROUP, type(agent), AGENTS) or path(type(agent))
+
+
+def is_own(name: str) -> bool:
+    """Whether it is `module:Class`: a user's own agent, which only a user may name."""
+    return ":" in name
+
+
+def is_of(kind: type, name: str) -> bool:
+    """Whether agents of that name are of this class; imports nothing."""
+    if name in AGENTS:
+        return type(AGENTS[name].agent) is kind
+    return is_named(kind, name) or declared_name(GROUP, kind, AGENTS) == name

@@ -18,12 +18,32 @@ class UsageError(Exception):
     """A mistake on the command line, as a sentence."""
 
 
+OwnAgent = Annotated[
+    str | None,
+    tyro.conf.arg(
+        metavar="MODULE:CLASS",
+        help="The class of the agent, where an agent of your own was trained. Its module is imported.",
+    ),
+]
+
+
+def own_agent(name: str | None) -> type | None:
+    """The class that --agent names, if it was given."""
+    from beliefrl import agents
+
+    return None if name is None else agents.find_class(name)
+
+
 def agent_options(agent: Any, own: dict[str, Any]) -> type:
     """The options of a command: its own, (type, default) each, and the hyperparameters of an agent, if there is one."""
     fields = [(name, kind, dataclasses.field(default=default)) for name, (kind, default) in own.items()]
     if agent is None:
         return dataclasses.make_dataclass("Options", fields, frozen=True)
     hyperparameters = Annotated[type(agent), tyro.conf.arg(name="", help="Hyperparameters of the agent.")]
+    taken = set(_option_names(dataclasses.make_dataclass("Options", fields)))
+    for field in dataclasses.fields(agent):
+        if field.name in taken:
+            raise UsageError(f"{type(agent).__name__} has a field {field.name}, an option of this command: rename it.")
     fields.append(("agent", hyperparameters, dataclasses.field(default=agent)))
     return dataclasses.make_dataclass("Options", fields, frozen=True)
 
@@ -34,6 +54,7 @@ def agent_name(argv: Sequence[str], command: str, more: str = "") -> tuple[str, 
     if argv and argv[0] in ("-h", "--help"):
         print(f"usage: {usage} ...\n")
         print(f"`beliefrl agents` lists the agents; name one to see its options: beliefrl {command} vrm --help")
+        print("MODULE:CLASS is an agent of your own, in this folder or on the Python path.")
         raise SystemExit(0)
     if not argv or argv[0].startswith("-"):
         raise UsageError(f"No agent is named: write {usage}; `beliefrl agents` lists them.")

@@ -32,7 +32,7 @@ def bench(argv: Sequence[str]) -> None:
 
     sizes = (options.obs, options.actions, options.seeds)
     if name == "all":
-        results = {each: run_bench(agents.make(each), *sizes) for each in agents.names()}
+        results = {each: run_bench(agents.make(each), *sizes) for each in agents.AGENTS}
     else:
         results = run_bench(options.agent, *sizes, STARTED)
     if options.json:

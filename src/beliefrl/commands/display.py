@@ -193,14 +193,14 @@ def results_table(results: dict[str, Any], seeds: list[int], title: str) -> Tabl
 
 
 def run_table(run: Run, agent: Any) -> Table:
-    """The settings of a run, and its progress."""
+    """The settings of a run, and its progress. Without an agent all of its settings are shown."""
     table = Table(title=Text(str(run.folder)), title_justify="left", show_header=False)
 
     def add(name: str, value: str) -> None:
         table.add_row(name, Text(value))  # without markup: it may contain brackets
 
     config = run.config
-    own = {field.name: field.default for field in dataclasses.fields(agent)}
+    own = {} if agent is None else {field.name: field.default for field in dataclasses.fields(agent)}
     changed = [f"{name}={value}" for name, value in config["hyperparameters"].items() if _differs(value, own.get(name))]
     constants = [f"{name}={value}" for name, value in config["constants"].items()]
     observed = [] if config.get("observe") is None else [f"observe={' '.join(map(str, config['observe']))}"]

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from beliefrl.commands.arguments import parse
+from beliefrl.commands.arguments import OwnAgent, own_agent, parse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +34,7 @@ class PredictOptions:
     """Of the episode, its actions and the draws: the same one gives the same picture."""
     sampled: bool = False
     """Actions are sampled; else they are the policy's mode."""
+    agent: OwnAgent = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,6 +57,7 @@ class VideoOptions:
     """Of the first episode; the next ones have the numbers that follow."""
     sampled: bool = False
     """Actions are sampled; else they are the policy's mode."""
+    agent: OwnAgent = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,6 +80,7 @@ class FilmOptions:
     """Of the episodes: the same one gives the same strip."""
     sampled: bool = False
     """Actions are sampled; else they are the policy's mode."""
+    agent: OwnAgent = None
 
 
 def predict(argv: Sequence[str]) -> None:
@@ -91,7 +94,7 @@ def predict(argv: Sequence[str]) -> None:
     path = options.out or run.folder / "predictions.png"
     figures.paths(path)  # before an episode is played for it
     names = ("seed", "model", "start", "horizon", "samples", "episode_seed", "sampled")
-    predicted = predictions(run, **{name: getattr(options, name) for name in names})
+    predicted = predictions(run, agent=own_agent(options.agent), **{name: getattr(options, name) for name in names})
     _written(draw_predictions(predicted, path, options.entries or None))
 
 
@@ -101,7 +104,9 @@ def video(argv: Sequence[str]) -> None:
     from beliefrl.viewing import films
 
     names = ("seed", "episode_seed", "sampled", "episodes", "fps", "steps")
-    played = films.video(options.run, options.out, **{name: getattr(options, name) for name in names})
+    played = films.video(
+        options.run, options.out, agent=own_agent(options.agent), **{name: getattr(options, name) for name in names}
+    )
     for index, episode in enumerate(played):
         reached = {None: "", True: ", success", False: ", no success"}[episode.success]
         length = len(episode.steps.reward) - 1
@@ -115,7 +120,8 @@ def film(argv: Sequence[str]) -> None:
     from beliefrl.viewing import films
 
     names = ("frames", "seed", "episode_seed", "sampled", "steps")
-    _written(films.film(options.runs, options.out, **{name: getattr(options, name) for name in names}))
+    given = {name: getattr(options, name) for name in names}
+    _written(films.film(options.runs, options.out, agent=own_agent(options.agent), **given))
 
 
 def _written(path: pathlib.Path) -> None:

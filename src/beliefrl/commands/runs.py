@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from beliefrl.commands.arguments import parse
+from beliefrl.commands.arguments import OwnAgent, own_agent, parse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,6 +23,7 @@ class EvaluateOptions:
     """Of these episodes: the same seed gives the same numbers."""
     json: bool = False
     """Print one JSON object: per mode the mean, S.E.M., every seed's mean, and success."""
+    agent: OwnAgent = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +36,7 @@ class ExportOptions:
     """The file to write; one that is there is replaced."""
     seed: int | None = None
     """Which of the run's seeds; None is its first."""
+    agent: OwnAgent = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,12 +52,14 @@ def show(argv: Sequence[str]) -> None:
     options = parse(ShowOptions, argv, "beliefrl show")
     from rich.console import Console
 
+    from beliefrl.agents import is_own
     from beliefrl.commands.display import results_table, run_table
     from beliefrl.runs.run import Run
     from beliefrl.training.evaluation import agent_of
 
     run, console = Run(options.run), Console()
-    table, results = run_table(run, agent_of(run)), run.results()
+    agent = None if is_own(run.config["agent"]) else agent_of(run)  # a user's is not needed to show what is recorded
+    table, results = run_table(run, agent), run.results()
     console.print(table)
     if results:
         console.print(results_table(results, run.seeds, f"after {results['step']:,} steps"))
@@ -73,7 +77,7 @@ def evaluate(argv: Sequence[str]) -> None:
     from beliefrl.training.evaluation import evaluate as play
 
     run = Run(options.run)
-    results = play(run, options.episodes, options.seed)
+    results = play(run, options.episodes, options.seed, agent=own_agent(options.agent))
     if options.json:
         print(json.dumps(results))
         return
@@ -86,5 +90,5 @@ def export(argv: Sequence[str]) -> None:
     options = parse(ExportOptions, argv, "beliefrl export")
     from beliefrl.policy import load
 
-    load(options.run, options.seed).export(options.file)
+    load(options.run, options.seed, agent=own_agent(options.agent)).export(options.file)
     print(f"written to {options.file}: jax.export.deserialize reads it")

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from beliefrl.commands.arguments import agent_name, agent_options, named_values, parse
+from beliefrl.commands.arguments import OwnAgent, agent_name, agent_options, named_values, own_agent, parse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,6 +20,7 @@ class ResumeOptions:
     """The run's folder."""
     steps: int | None = None
     """Train for so many environment steps in all; None: as many as before. They may only grow."""
+    agent: OwnAgent = None
 
 
 def train(argv: Sequence[str]) -> None:
@@ -81,8 +82,8 @@ def train(argv: Sequence[str]) -> None:
     task = tasks.make(options.task, options.observe or None, **named_values(options.constants, "--constants"))
     console = Console()
     if options.resume and options.out is not None and os.path.exists(options.out / "config.json"):  # noqa: PTH110 - pathlib's raises where a name is too long
-        _same_training(Run(options.out), name, tasks.describe(task), options)
-        _resume(options.out, options.training.steps)
+        _same_training(Run(options.out), agents.name_of(options.agent), tasks.describe(task), options)
+        _resume(options.out, options.training.steps, type(options.agent) if agents.is_own(name) else None)
         return
     with TrainingDisplay(console, options.training.steps) as display:
         run = run_training(
@@ -96,11 +97,12 @@ def _ended(run: Any) -> None:
     from rich.console import Console
 
     from beliefrl.commands.display import results_table
+    from beliefrl.training.evaluation import as_argument
 
     console, results = Console(), run.results() or {}
     title = f"{run.config['agent']} on {run.config['task']} after {results['step']:,} steps"
     console.print(results_table(results, run.seeds, title))
-    line = f"saved in {run.folder}: see curve.png; `beliefrl evaluate {run.folder}` plays more episodes"
+    line = f"saved in {run.folder}: see curve.png; `beliefrl evaluate {as_argument(run)}` plays more episodes"
     console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
@@ -119,10 +121,10 @@ def _same_training(run: Any, agent: str, task: dict[str, Any], options: Any) -> 
 def resume(argv: Sequence[str]) -> None:
     """`beliefrl resume RUN ...`."""
     options = parse(ResumeOptions, argv, "beliefrl resume")
-    _resume(options.run, options.steps)
+    _resume(options.run, options.steps, own_agent(options.agent))
 
 
-def _resume(folder: pathlib.Path, steps: int | None) -> None:
+def _resume(folder: pathlib.Path, steps: int | None, agent: type | None) -> None:
     from rich.console import Console
 
     from beliefrl.commands.display import TrainingDisplay
@@ -131,4 +133,4 @@ def _resume(folder: pathlib.Path, steps: int | None) -> None:
 
     run = Run(folder)
     with TrainingDisplay(Console(), steps or run.options.steps) as display:
-        _ended(go_on(run, steps, report=display, own_process=True))
+        _ended(go_on(run, steps, report=display, agent=agent, own_process=True))

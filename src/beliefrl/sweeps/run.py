@@ -7,12 +7,13 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
+from beliefrl import agents
 from beliefrl.runs.folder import locked
 from beliefrl.sweeps import cluster, files, local
 from beliefrl.sweeps import plan as plans
 from beliefrl.sweeps.plan import Experiment, Training
 from beliefrl.training.stop import Requests, Stopped
-from beliefrl.types import UserError
+from beliefrl.types import UserError, one_line
 
 LOOK_EVERY = 0.5  # seconds
 ALL = 10_000  # more seeds than an experiment has
@@ -73,11 +74,13 @@ def sweep(
     folder = pathlib.Path(out)
     plans.plan(experiments)  # complain before there is a folder
     with _lock(folder):
+        before = files.read(folder)
+        _check_named(folder, before, experiments)
         slots = [] if ray else ["-"] if workers == 0 else local.slots(workers)
         launcher = cluster.Cluster(folder, ray, workers) if ray else local.Local(folder, slots)
         on_gpu = launcher.has_gpus if isinstance(launcher, cluster.Cluster) else slots[0].startswith("gpu")
         together = seeds_per_run or (ALL if on_gpu else None)
-        status = _status(folder, plans.extended(files.read(folder), experiments, together))
+        status = _status(folder, plans.extended(before, experiments, together))
         with Requests() as requests:
             try:
                 _loop(folder, status, launcher, report or (lambda status: None), requests)
@@ -90,6 +93,15 @@ def sweep(
             f"and give the command again; {folder}/logs has what each said."
         )
     return status
+
+
+def _check_named(folder: pathlib.Path, before: Sequence[Training], experiments: Sequence[Experiment]) -> None:
+    """Refuse to import an agent that only the sweep's folder names."""
+    named = {experiment.agent for experiment in experiments}
+    for training in before:
+        if agents.is_own(training.agent) and training.agent not in named:
+            shown = one_line(training.agent)
+            raise UserError(f"{folder} trains {shown}: name that agent again, with --agents {shown} and its --tasks.")
 
 
 def _status(folder: pathlib.Path, trainings: Sequence[Training]) -> SweepStatus:

@@ -8,12 +8,13 @@ from typing import Any, Protocol, runtime_checkable
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
+from beliefrl.imports import declared, declared_name, load_declared, path
 from beliefrl.tasks import registered
 from beliefrl.tasks.cartpole import CartPole
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.pendulum import Pendulum
 from beliefrl.tasks.target_reaching import TargetReaching
-from beliefrl.types import Spec, UserError, check_indices, tuples
+from beliefrl.types import Spec, UserError, check_indices, said, tuples
 
 
 @runtime_checkable
@@ -119,11 +120,18 @@ TASKS: dict[str, type[Any]] = {
     "cartpole": CartPole,
     "target-reaching": TargetReaching,
 }
+GROUP = "beliefrl.tasks"  # of entry points
 MASKS = {"-v": "velocities", "-p": "positions"}
 
 
 def names() -> dict[str, str]:
-    """Every task's name with a sentence on it, in the order of the paper's table (Appendix B)."""
+    """Every task's name with a sentence on it: ours, then those of installed packages, which are not imported."""
+    ours = our_names()
+    return ours | {name: f"{value}, of an installed package." for name, value in declared(GROUP, ours).items()}
+
+
+def our_names() -> dict[str, str]:
+    """The names of the tasks of this library, in the order of the paper's table (Appendix B)."""
     listed = {}
     for name, task in TASKS.items():
         listed |= _masked(name, (task.__doc__ or "").split("\n")[0], task)
@@ -134,7 +142,26 @@ def names() -> dict[str, str]:
 
 def knows(name: str) -> bool:
     """Whether `make` may know a task of that name."""
-    return name.startswith(registered.PREFIX) or name in names()
+    return name.startswith(registered.PREFIX) or name in our_names() or _declared(name) is not None
+
+
+def _declared(name: str) -> tuple[str, str] | None:
+    """The entry point, (name, module:Class), of a task that is not ours, or of whose -v or -p version this is."""
+    theirs = declared(GROUP, our_names())
+    for each in (name, name[:-2] if name[-2:] in MASKS else name):
+        if each in theirs:
+            return each, theirs[each]
+    return None
+
+
+def _declared_class(name: str, value: str) -> type:
+    """The class of an entry point, once it is sure to be one of tasks."""
+    kind = load_declared(GROUP, name, value)
+    lacks = [each for each in vars(Task) if not each.startswith("_") and each not in dir(kind)]
+    if lacks or not dataclasses.is_dataclass(kind):
+        what = f"lacks {', '.join(lacks)}" if lacks else "is no dataclass"
+        raise UserError(f"{name}, the entry point {value}, is no task: it {what} (see beliefrl.Task).")
+    return kind
 
 
 def _masked(name: str, about: str, task: Any) -> dict[str, str]:
@@ -151,7 +178,7 @@ def masks(task: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Which entries of the observation are velocities, and which are not; nothing of a task that does not say."""
     if isinstance(task, registered.Known):
         return task.velocities, task.positions
-    return getattr(task, "VELOCITIES", ()), getattr(task, "POSITIONS", ())
+    return tuple(getattr(task, "VELOCITIES", ())), tuple(getattr(task, "POSITIONS", ()))
 
 
 def _spaced(indices: tuple[int, ...]) -> str:
@@ -174,27 +201,48 @@ def make(name: str, /, observe: Sequence[int | str] | int | str | None = None, *
         UserError: no task has that name, it has no such constant, a value is impossible, or `observe` does not fit it.
     """
     task = _make(name, constants)
-    return task if observe is None else _observed(task, _indices(name, observe))
+    return task if observe is None else _observed(task, _indices(name, task, observe))
 
 
 def _make(name: str, constants: dict[str, Any]) -> Any:
     if name.startswith(registered.PREFIX):
         return registered.make(name.removeprefix(registered.PREFIX), constants)
-    if name not in names():
-        near = _similar(name)
-        hint = f"did you mean {near}?" if near else "`beliefrl tasks` lists them all."
-        raise UserError(f"There is no task {name!r}: {hint}")
+    if name not in our_names():
+        return _make_declared(name, constants)
     base, mask = (name[:-2], MASKS[name[-2:]]) if name[-2:] in MASKS else (name, None)
     if base in registered.ROBOTS:
         robot = registered.ROBOTS[base]
         task = registered.make(robot.id, constants, name)
         return task if mask is None else dataclasses.replace(task, indices=getattr(robot, mask))
-    fields = [field.name for field in dataclasses.fields(TASKS[base])]
+    task = _built(base, TASKS[base], constants)
+    return task if mask is None else Observed(task, getattr(task, mask.upper()))
+
+
+def _make_declared(name: str, constants: dict[str, Any]) -> Any:
+    """A task of an installed package, or a version of it with a part of the observation."""
+    found = _declared(name)
+    if found is None:
+        near = _similar(name)
+        hint = f"did you mean {near}?" if near else "`beliefrl tasks` lists them all."
+        raise UserError(f"There is no task {name!r}: {hint}")
+    base, value = found
+    task = _built(base, _declared_class(base, value), constants)
+    return task if name == base else observe(task, _indices(base, task, MASKS[name[-2:]]))
+
+
+def _built(name: str, kind: type, constants: dict[str, Any]) -> Any:
+    fields = [field.name for field in dataclasses.fields(kind)]
     for constant in constants:
         if constant not in fields:
-            raise UserError(f"The task {base} has no constant {constant!r}: it has {', '.join(fields)}.")
-    task = TASKS[base](**tuples(constants))
-    return task if mask is None else Observed(task, getattr(task, mask.upper()))
+            raise UserError(f"The task {name} has no constant {constant!r}: it has {', '.join(fields)}.")
+    try:
+        return kind(**tuples(constants))
+    except UserError:
+        raise
+    except Exception as error:  # whatever a task of a stranger's may raise
+        if name in TASKS:
+            raise
+        raise UserError(f"The task {name} cannot be made: {said(error)}.") from None
 
 
 def _similar(name: str) -> str | None:
@@ -207,11 +255,12 @@ def _observed(task: Any, indices: tuple[int, ...]) -> Any:
     return observe(task, indices)  # in `make` this word is an argument
 
 
-def _indices(name: str, observe: Sequence[int | str] | int | str) -> tuple[int, ...]:
-    """What `observe` means for the task of that name."""
+def _indices(name: str, task: Any, observe: Sequence[int | str] | int | str) -> tuple[int, ...]:
+    """What `observe` means for a task, which has that name."""
     given = [observe] if isinstance(observe, str | int) else list(observe)
     if len(given) == 1 and given[0] in MASKS.values():
-        of = registered.KNOWN.get(name.removeprefix(registered.PREFIX), registered.ROBOTS.get(name, TASKS.get(name)))
+        of: Any = registered.KNOWN.get(name.removeprefix(registered.PREFIX), registered.ROBOTS.get(name))
+        of = of or TASKS.get(name) or task
         velocities, positions = masks(of)
         if not velocities:
             raise UserError(f"{name} does not say which of its observations are {given[0]}: give their indices.")
@@ -227,19 +276,20 @@ def _indices(name: str, observe: Sequence[int | str] | int | str) -> tuple[int, 
 def describe(task: Any) -> dict[str, Any]:
     """{"task": the name for `make`, "constants": what it was made with, "observe": the indices, if given apart}.
 
-    A task that `make` cannot make is named module:Class, and has no constants.
+    A task that `make` cannot make is named module:Class, and has no constants. Nothing is imported.
     """
     if isinstance(task, GymnasiumTask):
         return _describe_gymnasium(task)
     base, indices = (task.task, task.indices) if isinstance(task, Observed) else (task, None)
-    for name, known in TASKS.items():
-        velocities, positions = masks(known)
-        suffix = {None: "", velocities: "-v", positions: "-p"}.get(indices)
-        if type(base) is known and suffix is not None:
-            return {"task": name + suffix, "constants": dataclasses.asdict(base), "observe": None}
+    velocities, positions = masks(base)
+    suffix = {None: "", velocities: "-v", positions: "-p"}.get(indices)
+    name = next((name for name, known in TASKS.items() if type(base) is known), None)
+    name = name or declared_name(GROUP, type(base), our_names())
+    if name is not None and suffix is not None:
+        return {"task": name + suffix, "constants": dataclasses.asdict(base), "observe": None}
     if isinstance(task, Observed):
         return describe(task.task) | {"observe": list(task.indices)}
-    return {"task": f"{type(task).__module__}:{type(task).__qualname__}", "constants": {}, "observe": None}
+    return {"task": path(type(task)), "constants": {}, "observe": None}
 
 
 def _describe_gymnasium(task: GymnasiumTask) -> dict[str, Any]:

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, Key
 
 from beliefrl import agents, tasks
-from beliefrl.agents import Agent
+from beliefrl.agents import Agent, hyperparameters
+from beliefrl.imports import path
 from beliefrl.runs.options import MOST_EPISODES
 from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
@@ -18,7 +19,7 @@ from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.host_evaluation import Evaluation
 from beliefrl.training.phases import evaluate as evaluate_seed
 from beliefrl.training.rollout import Episode
-from beliefrl.types import LARGEST, UserError, tuples
+from beliefrl.types import LARGEST, UserError, one_line, tuples
 
 MODES = ("sampled", "mode")  # how actions are chosen; the axis of an evaluation's leaves after that of seeds
 
@@ -43,24 +44,30 @@ def summary(result: Episode, has_success: bool) -> dict[str, Any]:
     return table
 
 
-def restore(run: Run, task: Task | GymnasiumTask | None = None) -> tuple[Agent, Any, Any, str]:
+def restore(
+    run: Run, task: Task | GymnasiumTask | None = None, agent: Agent | type | None = None
+) -> tuple[Agent, Any, Any, str]:
     """The agent, the task, the trained states (leading axis: seed) and the precision (`Run.precision`) of a run.
 
-    `task` is needed only where the run was trained on a task of your own.
+    `task` is needed only where the run was trained on a task of your own, `agent` only where it is of an agent of your
+    own (`agent_of`).
 
     Raises:
         UserError: the run's agent or task is unknown here, or nothing was saved.
     """
-    agent = agent_of(run)
+    made = agent_of(run, agent)
     found = task_of(run) if task is None else task
     spec = found.spec
     keys = jax.random.split(jax.random.key(0), len(run.seeds))
-    like = jax.eval_shape(jax.vmap(lambda key: agent.networks(agent.init(key, spec))), keys)
-    return agent, found, run.load(like), run.precision
+    like = jax.eval_shape(jax.vmap(lambda key: made.networks(made.init(key, spec))), keys)
+    return made, found, run.load(like), run.precision
 
 
 def restore_seed(
-    run: Run | str | os.PathLike[str], seed: int | None = None, task: Task | GymnasiumTask | None = None
+    run: Run | str | os.PathLike[str],
+    seed: int | None = None,
+    task: Task | GymnasiumTask | None = None,
+    agent: Agent | type | None = None,
 ) -> tuple[Agent, Any, Any, str]:
     """The same of one seed of a run, its first if `seed` is None; see `restore`.
 
@@ -71,18 +78,38 @@ def restore_seed(
     seed = run.seeds[0] if seed is None else seed
     if seed not in run.seeds:
         raise UserError(f"{run.folder} has no seed {seed}: it has {', '.join(map(str, run.seeds))}.")
-    agent, found, states, precision = restore(run, task)
-    return agent, found, jax.tree.map(lambda leaf: leaf[run.seeds.index(seed)], states), precision
+    made, found, states, precision = restore(run, task, agent)
+    return made, found, jax.tree.map(lambda leaf: leaf[run.seeds.index(seed)], states), precision
 
 
-def agent_of(run: Run) -> Agent:
+def agent_of(run: Run, agent: Agent | type | None = None) -> Agent:
     """The agent of a run, before it was trained.
 
+    Args:
+        run: a run.
+        agent: the class of an agent of your own, or one of that class; it gets the hyperparameters that the run
+            records. A run's folder is data, so what only it names is never imported.
+
     Raises:
-        UserError: it is unknown here, or one of its settings is unknown or impossible.
+        UserError: it is unknown here, one of its settings is unknown or impossible, or `agent` is of another class.
     """
+    name = run.config["agent"]
+    if agent is None and agents.is_own(name):
+        shown = one_line(name)
+        raise UserError(f"{run.folder} was trained by {shown}: give --agent {shown}, or in Python agent=.")
+    if agent is not None:
+        kind = agents.check_class(agent if isinstance(agent, type) else type(agent))
+        if not agents.is_of(kind, name):
+            raise UserError(f"{run.folder} was trained by {one_line(name)}, not by {path(kind)}: give that agent.")
     with _naming(run):
-        return agents.make(run.config["agent"], **tuples(run.config["hyperparameters"]))
+        like = agents.named(name) if agent is None or name in agents.AGENTS else agent
+        return hyperparameters.restored(like, run.config["hyperparameters"])
+
+
+def as_argument(run: Run) -> str:
+    """How commands take a run: its folder, and --agent where an agent of a user's was trained."""
+    name = run.config["agent"]
+    return f"{run.folder} --agent {one_line(name)}" if agents.is_own(name) else str(run.folder)
 
 
 def task_of(run: Run | str | os.PathLike[str]) -> Any:
@@ -110,7 +137,11 @@ def _naming(run: Run) -> Iterator[None]:
 
 
 def evaluate(
-    run: Run | str | os.PathLike[str], episodes: int = 20, seed: int = 0, task: Task | GymnasiumTask | None = None
+    run: Run | str | os.PathLike[str],
+    episodes: int = 20,
+    seed: int = 0,
+    task: Task | GymnasiumTask | None = None,
+    agent: Agent | type | None = None,
 ) -> dict[str, Any]:
     """Let the trained agents of a run play `episodes` new episodes, once with sampled and once with mode actions.
 
@@ -119,6 +150,7 @@ def evaluate(
         episodes: episodes for each seed of the run and each mode.
         seed: of these episodes: the same seed gives the same numbers.
         task: needed only where the run was trained on a task of your own.
+        agent: needed only where an agent of your own was trained: its class, or one of them.
 
     Returns:
         {"episodes", "sampled": {"mean", "sem", "seeds", "success", "seeds_success"}, "mode": the same}. Returns are
@@ -132,13 +164,13 @@ def evaluate(
     if not 0 <= seed <= LARGEST:
         raise UserError(f"seed={seed} is impossible: it must be from 0 to {LARGEST}.")
     run = run if isinstance(run, Run) else Run(run)
-    agent, found, states, precision = restore(run, task)
+    trained, found, states, precision = restore(run, task, agent)
     keys = jax.random.split(jax.random.key(seed), len(run.seeds))
     with jax.default_matmul_precision(precision):
         if isinstance(found, GymnasiumTask):
-            result = _on_host(agent, found, states, keys, episodes, run.seeds)
+            result = _on_host(trained, found, states, keys, episodes, run.seeds)
         else:
-            compiled = jax.jit(jax.vmap(lambda state, key: evaluate_seed(agent, found, state, key, episodes)))
+            compiled = jax.jit(jax.vmap(lambda state, key: evaluate_seed(trained, found, state, key, episodes)))
             result = compiled(states, keys)
     return {"episodes": episodes} | summary(result, found.spec.has_success)
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from beliefrl import agents, tasks
-from beliefrl.agents import Agent
+from beliefrl.agents import Agent, hyperparameters
 from beliefrl.analysis.curves import draw_curve
 from beliefrl.runs import trackers
 from beliefrl.runs.checkpoint import Checkpoints, listed, was_ever_written
@@ -26,7 +26,7 @@ from beliefrl.runs.run import Recorder, Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import log
-from beliefrl.training.evaluation import agent_of, task_of, tuples
+from beliefrl.training.evaluation import agent_of, as_argument, task_of, tuples
 from beliefrl.training.phases import SeedState
 from beliefrl.training.schedule import Event, Options, Phase, Snapshot, TrainingProgress, capacity, stages
 from beliefrl.training.stop import Requests, Stopped
@@ -47,7 +47,7 @@ def train(
     """Train an agent on a task and record it in a folder.
 
     Args:
-        agent: an agent, or the name of one with its default hyperparameters.
+        agent: an agent, or the name of one with its default hyperparameters (`make_agent`).
         task: a task, or the name of one.
         out: the run's folder; None is runs/AGENT-TASK-1, or the next free number. It must not exist, unless it is empty
             or a training left it that ended before it saved an agent or a checkpoint; then it is used again.
@@ -76,7 +76,7 @@ def train(
     _ = capacity(agent, chosen), made.spec, trackers.check(chosen.track)  # raise before the folder is made
     config = {
         "agent": agents.name_of(agent),
-        "hyperparameters": dataclasses.asdict(agent),  # pyright: ignore[reportArgumentType]
+        "hyperparameters": hyperparameters.of(agent),
         **tasks.describe(made),
         "options": dataclasses.asdict(chosen),
         **provenance(),
@@ -90,6 +90,7 @@ def resume(
     steps: int | None = None,
     task: Task | GymnasiumTask | None = None,
     report: Report | None = None,
+    agent: Agent | type | None = None,
     own_process: bool = False,
 ) -> Run:
     """Go on with a training from its last checkpoint.
@@ -103,6 +104,7 @@ def resume(
         steps: train for so many environment steps in all; None: as many as before. They may only grow.
         task: needed only where the run was trained on a task of your own.
         report, own_process: as in `train`.
+        agent: needed only where an agent of your own was trained: its class, or an instance.
 
     Raises:
         UserError: there is no such run, none of its checkpoints is good or left, another process trains it, or `steps`
@@ -110,7 +112,7 @@ def resume(
         Stopped: Ctrl-C or SIGTERM, once a checkpoint is written.
     """
     run = run if isinstance(run, Run) else Run(run)
-    folder, agent = run.folder, agent_of(run)
+    folder, made_by = run.folder, agent_of(run, agent)
     begins_again = not was_ever_written(folder) and not (folder / "results.json").exists()
     if not (begins_again or listed(folder)):
         raise UserError(f"{folder} has no checkpoint to go on from any more: train again, with another --out.")
@@ -123,7 +125,7 @@ def resume(
         options = dataclasses.replace(Options(**before), **({} if steps is None else {"steps": steps}))
         trackers.check(options.track)
         recorder.amend({"options": dataclasses.asdict(options)}, provenance())
-        training = _Training(recorder, agent, made, options, report, own_process)
+        training = _Training(recorder, made_by, made, options, report, own_process)
         if begins_again:
             training.begin_again()
         stack.pop_all()
@@ -172,7 +174,7 @@ class _Training:
         except OSError as error:
             raise UserError(
                 f"{self.recorder.folder} cannot be written ({error.strerror}): fix that, then "
-                f"`beliefrl resume {self.recorder.folder}` goes on."
+                f"`beliefrl resume {as_argument(self.recorder)}` goes on."
             ) from None
         return self.recorder
 
@@ -267,8 +269,8 @@ class _Training:
         self._save(snapshot)
         if asked and not self._has_ended(progress):
             self.checkpoints.wait()
-            folder = self.recorder.folder
-            raise Stopped(f"stopped at step {progress.step:,}; `beliefrl resume {folder}` goes on from there.", asked)
+            run = as_argument(self.recorder)
+            raise Stopped(f"stopped at step {progress.step:,}; `beliefrl resume {run}` goes on from there.", asked)
 
     def _save(self, snapshot: Snapshot) -> None:
         replay = snapshot.seeds.replay

@@ -122,6 +122,7 @@ def play(
     steps: int | None = None,
     at: Container[int] = (),
     task: Task | GymnasiumTask | None = None,
+    agent: Agent | type | None = None,
 ) -> Trajectory:
     """Play an episode with what a run has learned.
 
@@ -133,12 +134,13 @@ def play(
         steps: end it after so many; None: when the task does.
         at: the moments of which a frame is kept, and with them the last one; range(0, 1000, 10) is every tenth.
         task: needed only where the run was trained on a task of your own.
+        agent: needed only where an agent of your own was trained: its class, or one of them.
 
     Raises:
         UserError: there is no such run or seed, a number is impossible, or the task fails or cannot be rendered.
     """
     check_episode(episode_seed, steps)
-    with Player(*restore_seed(run, seed, task), rendered=bool(at)) as player:
+    with Player(*restore_seed(run, seed, task, agent), rendered=bool(at)) as player:
         return player.play(episode_seed, sampled, steps, at)
 
 

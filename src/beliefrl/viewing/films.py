@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
+from beliefrl.agents import Agent, is_own
 from beliefrl.analysis import figures
 from beliefrl.runs.arrays import replacing
 from beliefrl.runs.run import Run
@@ -42,6 +43,7 @@ def video(
     fps: float | None = None,
     steps: int | None = None,
     task: Task | GymnasiumTask | None = None,
+    agent: Agent | type | None = None,
 ) -> list[Trajectory]:
     """Film episodes of what a run has learned; returns them, without frames. The file is there whole or not at all.
 
@@ -56,6 +58,7 @@ def video(
             in which steps beyond 50 a second are left out.
         steps: end each episode after so many; None: when the task does.
         task: needed only where the run was trained on a task of your own.
+        agent: needed only where an agent of your own was trained: its class, or one of them.
 
     Raises:
         UserError: there is no such run or seed, a number is impossible, the task cannot be rendered, imageio-ffmpeg is
@@ -69,7 +72,7 @@ def video(
         raise UserError(f"fps={fps} is impossible: it must be a number above 0 and up to 1000.")
     kind = _kind(path)
     figures.check_folder(path)
-    with Player(*restore_seed(run, seed, task), rendered=True) as player:
+    with Player(*restore_seed(run, seed, task, agent), rendered=True) as player:
         pace = rendering.pace(player.environment)
         every = 1 if fps else math.ceil(pace / FASTEST)
         with _written(path, kind, fps or pace / every) as add:
@@ -193,6 +196,7 @@ def film(
     sampled: bool = False,
     steps: int | None = None,
     task: Task | GymnasiumTask | None = None,
+    agent: Agent | type | None = None,
 ) -> pathlib.Path:
     """Draw a film strip: a row for each run, of one episode's frames, evenly spaced, from its first moment to its last.
 
@@ -207,6 +211,8 @@ def film(
         sampled: whether actions are sampled; else they are the policy's mode.
         steps: end the episodes after so many; None: when the task does.
         task: needed only where the runs were trained on a task of your own.
+        agent: needed only where agents of your own were trained: their class, or one of them. Runs of other agents are
+            drawn without it.
 
     Raises:
         UserError: there is no such run or seed, a number is impossible, or a task cannot be rendered.
@@ -219,15 +225,19 @@ def film(
     runs = [run if isinstance(run, Run) else Run(run) for run in runs]
     path = pathlib.Path(path or runs[0].folder / "film.png")
     figures.paths(path)
-    rows = [_strip(run, frames, seed, episode_seed, sampled, steps, task) for run in runs]
+    own = [agent if is_own(run.config["agent"]) else None for run in runs]
+    rows = [
+        _strip(run, frames, seed, episode_seed, sampled, steps, task, made_by)
+        for run, made_by in zip(runs, own, strict=True)
+    ]
     return figures.save(_draw_strips(runs, rows), path)
 
 
 def _strip(
-    run: Run, frames: int, seed: int | None, episode_seed: int, sampled: bool, steps: int | None, task: Any
+    run: Run, frames: int, seed: int | None, episode_seed: int, sampled: bool, steps: int | None, task: Any, agent: Any
 ) -> Trajectory:
     """An episode with evenly spaced frames. It is played twice: only then is it known how long it is."""
-    with Player(*restore_seed(run, seed, task), rendered=True) as player:
+    with Player(*restore_seed(run, seed, task, agent), rendered=True) as player:
         length = len(player.play(episode_seed, sampled, steps).steps.reward) - 1
         at = {round(time) for time in np.linspace(0, length, frames)}
         return player.play(episode_seed, sampled, steps, at)

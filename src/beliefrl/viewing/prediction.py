@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl import tasks
-from beliefrl.agents import Predictive
+from beliefrl.agents import Agent, Predictive
 from beliefrl.analysis import figures
 from beliefrl.models.nets import Gaussian
 from beliefrl.runs.run import Run
@@ -79,6 +79,7 @@ def predictions(
     episode_seed: int = 0,
     sampled: bool = False,
     task: Task | GymnasiumTask | None = None,
+    agent: Agent | type | None = None,
 ) -> Predictions:
     """Play an episode with what a run has learned, and predict it.
 
@@ -92,6 +93,7 @@ def predictions(
         episode_seed: of the episode, its actions and these draws.
         sampled: whether actions are sampled; else they are the policy's mode.
         task: needed only where the run was trained on a task of your own.
+        agent: needed only where an agent of your own was trained: its class, or one of them.
 
     Raises:
         UserError: the agent has no such model or none at all, or a number is impossible.
@@ -99,9 +101,9 @@ def predictions(
     check_episode(episode_seed)
     _check_sizes(start, horizon, samples)
     run = run if isinstance(run, Run) else Run(run)
-    agent, found, state, precision = restore_seed(run, seed, task)
-    name = _model(run, agent, model)
-    with Player(agent, found, state, precision) as player:
+    trained, found, state, precision = restore_seed(run, seed, task, agent)
+    name = _model(run, trained, model)
+    with Player(trained, found, state, precision) as player:
         steps = player.play(episode_seed, sampled, (START if start is None else start) + horizon - 1).steps
     moments = len(steps.reward)
     start = min(START, moments // 2) if start is None else start
@@ -112,7 +114,7 @@ def predictions(
     steps = jax.tree.map(lambda leaf: leaf[: start + horizon], steps)
 
     time, key = np.arange(len(steps.reward)), jax.random.key(episode_seed)
-    compiled = jax.jit(partial(predict, agent), static_argnames=("model", "samples"))
+    compiled = jax.jit(partial(predict, trained), static_argnames=("model", "samples"))
     with jax.default_matmul_precision(precision):
         loops = [compiled(state, name, steps, seen, samples, key) for seen in (time >= 0, time < start)]
     seed = run.seeds[0] if seed is None else seed
@@ -132,7 +134,7 @@ def _model(run: Run, agent: Any, model: str | None) -> str:
     """Which of the agent's models to ask."""
     if not isinstance(agent, Predictive):
         raise UserError(
-            f"{run.folder} is of {run.config['agent']}, which has no model to predict with: vrm and slac have."
+            f"{run.folder} is of {run.config['agent']}, which has no model to predict with: vrm and slac have one."
         )
     if model is not None and model not in agent.predictors:
         has = ", ".join(agent.predictors)

@@ -1,0 +1,81 @@
+"""The hyperparameters of an agent, ours or a user's: set, recorded as JSON has them, and restored from that."""
+
+import dataclasses
+import difflib
+import functools
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from beliefrl.imports import path
+from beliefrl.types import UserError, said, tuples
+
+
+def build(agent: Any, hyperparameters: Mapping[str, Any], name: str | None = None) -> Any:
+    """An agent like this one, or of this class, in which these hyperparameters replace its own.
+
+    `name` is what messages call it; None is the path of its class.
+
+    Raises:
+        UserError: it has no such hyperparameter, lacks one that has no default, or a value is impossible.
+    """
+    kind = agent if isinstance(agent, type) else type(agent)
+    name = name or path(kind)
+    known = [field.name for field in dataclasses.fields(kind) if field.init]
+    for given in hyperparameters:
+        if given not in known:
+            near = difflib.get_close_matches(given, known, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"it has {', '.join(known) or 'none'}."
+            raise UserError(f"The agent {name} has no hyperparameter {given!r}: {hint}")
+    if agent is kind:
+        for missing in _required(kind) - set(hyperparameters):
+            raise UserError(f"The agent {name} has no default for {missing}: give that field one.")
+    make: Any = agent if isinstance(agent, type) else functools.partial(dataclasses.replace, agent)
+    try:
+        return make(**hyperparameters)
+    except UserError:
+        raise
+    except Exception as error:  # whatever an agent of a user's may raise
+        if kind.__module__.startswith("beliefrl."):
+            raise
+        raise UserError(f"The agent {name} cannot be made with its hyperparameters: {said(error)}.") from None
+
+
+def of(agent: Any) -> dict[str, Any]:
+    """What an agent was made with; dataclasses in it are dictionaries."""
+    values = dataclasses.asdict(agent)
+    return {field.name: values[field.name] for field in dataclasses.fields(agent) if field.init}
+
+
+def restored(agent: Any, recorded: Mapping[str, Any]) -> Any:
+    """An agent like this one, or of this class, with hyperparameters that were recorded as JSON.
+
+    JSON cannot hold some values, such as functions. There the agent's own are kept.
+
+    Raises:
+        UserError: as `build`.
+    """
+    like: Any = build(agent, {}) if isinstance(agent, type) and not _required(agent) else agent
+    values = {}
+    for name, value in tuples(recorded).items():
+        own = getattr(like, name, None)
+        if dataclasses.is_dataclass(own) and isinstance(value, dict):
+            values[name] = restored(own, value)
+        elif _is_json(own):
+            values[name] = value
+    return build(like, values)
+
+
+def _required(kind: type) -> set[str]:
+    """The fields without a default."""
+    unset = dataclasses.MISSING
+    fields = [field for field in dataclasses.fields(kind) if field.init]
+    return {field.name for field in fields if field.default is unset and field.default_factory is unset}
+
+
+def _is_json(value: Any) -> bool:
+    try:
+        json.dumps(value)
+    except (TypeError, ValueError):
+        return False
+    return True

@@ -1,0 +1,135 @@
+"""A run of a user's own agent is read as one of ours is, where the user says which class it is of."""
+
+import dataclasses
+import json
+import sys
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import beliefrl
+from beliefrl.agents.vrm import VRMAgent
+from beliefrl.models.nets import Gaussian
+from beliefrl.training.evaluation import agent_of
+from beliefrl.types import UserError, perception
+from worlds import CountingAgent
+
+OPTIONS = {"steps": 20, "eval_every": 20, "eval_episodes": 1, "checkpoint_steps": 10}
+
+
+@dataclasses.dataclass(frozen=True)
+class Foreteller(CountingAgent):
+    """Predicts what it perceives, exactly."""
+
+    predictors = ("memory",)
+
+    def predict(self, state, model, step, seen, key):
+        x = perception(step)
+        return Gaussian(x, jnp.zeros_like(x))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("own") / "run"
+    return beliefrl.train(Foreteller(cycle=2, cycle_windows=8), "pendulum-p", folder, **OPTIONS)
+
+
+def test_it_is_recorded_by_the_path_of_its_class(run):
+    assert run.config["agent"] == f"{__name__}:Foreteller"
+    assert run.config["hyperparameters"]["cycle"] == 2
+
+
+@pytest.mark.parametrize("agent", [Foreteller, Foreteller(cycle=4)], ids=["class", "instance"])
+def test_it_gets_the_hyperparameters_of_the_run(run, agent):
+    assert agent_of(run, agent) == Foreteller(cycle=2)
+
+
+def test_whatever_reads_a_run_takes_it(run, tmp_path):
+    assert beliefrl.evaluate(run, 2, agent=Foreteller)["episodes"] == 2
+    policy = beliefrl.load(run, agent=Foreteller())
+    np.testing.assert_array_equal(policy.predict(np.zeros(2))[0], [0.5])
+    trajectory = beliefrl.play(run, steps=3, agent=Foreteller)
+    np.testing.assert_array_equal(trajectory.steps.prev_action[1:], 0.5)
+    assert len(beliefrl.video(run, tmp_path / "film.gif", steps=3, agent=Foreteller)) == 1
+    assert beliefrl.film([run], tmp_path / "strip.png", steps=3, agent=Foreteller).exists()
+    predicted = beliefrl.predictions(run, start=2, horizon=3, samples=2, agent=Foreteller)
+    np.testing.assert_array_equal(predicted.errors()[1], 0.0)
+
+
+def test_it_is_resumed(run, tmp_path):
+    folder = tmp_path / "run"
+    before = beliefrl.train(Foreteller(), "pendulum-p", folder, **OPTIONS)
+    assert beliefrl.resume(before, 30, agent=Foreteller).results()["step"] == 30
+
+
+def readers(run, tmp_path):
+    return [
+        lambda **given: beliefrl.resume(run, **given),
+        lambda **given: beliefrl.evaluate(run, **given),
+        lambda **given: beliefrl.load(run, **given),
+        lambda **given: beliefrl.play(run, **given),
+        lambda **given: beliefrl.predictions(run, **given),
+        lambda **given: beliefrl.video(run, tmp_path / "film.gif", **given),
+        lambda **given: beliefrl.film([run], tmp_path / "strip.png", **given),
+    ]
+
+
+def test_without_it_one_sentence_says_what_to_give(run, tmp_path):
+    for read in readers(run, tmp_path):
+        with pytest.raises(
+            UserError, match=r"was trained by \S+:Foreteller: give --agent \S+:Foreteller, or in Python"
+        ):
+            read()
+
+
+@pytest.mark.parametrize("agent", [CountingAgent, VRMAgent()], ids=["another", "ours"])
+def test_an_agent_of_another_class_is_one_sentence(run, tmp_path, agent):
+    for read in readers(run, tmp_path):
+        with pytest.raises(UserError, match=r"was trained by \S+:Foreteller, not by \S+: give that agent"):
+            read(agent=agent)
+
+
+def test_ours_may_be_given_too(tmp_path):
+    config = {"agent": "vrm-single", "hyperparameters": {"d_size": 8}, "task": "pendulum", "constants": {}}
+    (tmp_path / "config.json").write_text(json.dumps(config | {"options": {"seed": 0, "seeds": 1}}))
+    assert agent_of(beliefrl.Run(tmp_path), VRMAgent) == VRMAgent(models="single", d_size=8)
+
+
+@pytest.fixture
+def altered(run, tmp_path):
+    """Writes a folder with the run's config in which something is changed."""
+
+    def write(**changes):
+        (tmp_path / "config.json").write_text(json.dumps(run.config | changes))
+        return beliefrl.Run(tmp_path)
+
+    return write
+
+
+def test_a_class_without_a_recorded_field_is_one_sentence(altered):
+    with pytest.raises(UserError, match=r"config\.json cannot be used: .* has no hyperparameter 'colour': it has step"):
+        agent_of(altered(hyperparameters={"colour": 1}), Foreteller)
+
+
+def test_what_is_no_agent_is_one_sentence(run, unchecked):
+    with pytest.raises(UserError, match="str is no agent: make it a frozen dataclass"):
+        agent_of(run, "Foreteller")  # pyright: ignore[reportArgumentType]
+
+
+def test_what_only_a_run_names_is_never_imported(altered, tmp_path, monkeypatch):
+    (tmp_path / "trap.py").write_text("raise AssertionError('It was imported.')")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    run = altered(agent="trap:Agent")
+    for read in readers(run, tmp_path):
+        with pytest.raises(UserError, match="was trained by trap:Agent: give --agent trap:Agent"):
+            read()
+        with pytest.raises(UserError, match="was trained by trap:Agent, not by"):
+            read(agent=Foreteller)
+    assert "trap" not in sys.modules
+
+
+def test_a_name_with_control_characters_is_told_without_them(altered):
+    with pytest.raises(UserError) as raised:
+        agent_of(altered(agent="trap\x1b[31m:Agent"))
+    assert str(raised.value).isprintable()
