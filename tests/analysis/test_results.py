@@ -1,4 +1,4 @@
-"""Results that are kept in one file: what comes back from it, and that figures of it are those of the runs."""
+"""Files of results: what is read back, and that figures are the same as those of the runs themselves."""
 
 import gzip
 import json
