@@ -1,4 +1,4 @@
-"""What a sweep consists of, before anything runs."""
+"""The list of trainings in a sweep."""
 
 import dataclasses
 import json
@@ -110,13 +110,13 @@ def test_names_tell_settings_apart_and_stay_short():
     ],
 )
 def test_every_mistake_is_found_before_anything_begins(experiment, phrase):
-    with pytest.raises(UserError) as told:
+    with pytest.raises(UserError) as error:
         plan([Experiment("sac-mlp", "pendulum"), experiment])
-    assert phrase in str(told.value)
+    assert phrase in str(error.value)
 
 
 def test_options_of_a_training_cannot_be_varied():
-    with pytest.raises(UserError, match="only hyperparameters can be varied"):
+    with pytest.raises(UserError, match="only hyperparameters can have several values"):
         plan(grid(["vrm"], ["pendulum"], {"steps": [10, 20]}))
 
 
