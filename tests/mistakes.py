@@ -144,7 +144,7 @@ MISTAKES = {
     f"{TRAIN} --keep-checkpoints 0": "keep_checkpoints=0 is impossible",
     f"{TRAIN} --observe 1": "give indices from 0 to 0",
     f"{TRAIN} --observe -1": "-1 is not an index of the observation, which has 1 entry",
-    f"{TRAIN} --observe velocities": "does not say which of its observations are velocities",
+    f"{TRAIN} --observe velocities": "does not define which entries are velocities",
     f"{MLP} pendulum --observe 3": "give indices from 0 to 2",
     f"{MLP} pendulum --observe 99": "99 is not an index of the observation, which has 3 entries",
     f"{MLP} pendulum --observe 1 1": "observe=1 1 has the index 1 twice",

@@ -51,7 +51,9 @@ class Pretence:
         folder.mkdir(exist_ok=True)
         rest = {"hyperparameters": {}, "task": "", "constants": {}, "options": {"seed": 0, "seeds": 1}}
         (folder / "config.json").write_text(json.dumps({"agent": "vrm", **rest}))
-        (folder / "results.json").write_text(json.dumps({"step": training.steps}))
+        mode = {"mean": 0.0, "sem": None, "seeds": [0.0], "success": None, "seeds_success": None}
+        results = {"step": training.steps, "sampled": mode, "mode": mode}
+        (folder / "results.json").write_text(json.dumps(results))
 
     def stop(self):
         self.running = {}
@@ -89,7 +91,7 @@ def test_a_sweep_can_be_made_longer(tmp_path):
     assert Pretence.started == ["vrm-pendulum-seed0"]
 
 
-def test_a_failure_is_told_and_the_others_go_on(tmp_path, monkeypatch):
+def test_a_failure_is_reported_and_the_others_continue(tmp_path, monkeypatch):
     monkeypatch.setattr(Pretence, "fails", "pendulum-seed0")
     with pytest.raises(UserError, match=r"1 of 4 trainings failed, such as vrm-pendulum-seed0 \(it broke\)"):
         sweep(TWO, tmp_path)

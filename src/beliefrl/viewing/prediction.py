@@ -148,8 +148,8 @@ def draw_predictions(
 ) -> pathlib.Path:
     """Draw predictions and truth, one row for each entry of the observation and one for the reward.
 
-    A row is labelled with the task's name of the entry and its unit, or with its index in the full observation, "entry
-    2". Bands are ± σ. The numbers are root mean squared errors from `start` on. Writes a PNG and a PDF; returns the
+    A row is labelled with the task's name of the entry and its unit, or with its index in the full observation:
+    "entry 2". Bands are ± σ. Numbers are root mean squared errors from `start` on. Writes a PNG and a PDF; returns the
     path of the PNG.
 
     Args:
