@@ -1,4 +1,4 @@
-"""What users type and find that is wrong, and a phrase of the one sentence that each of it ends with."""
+"""Mistakes of users on the command line, each with a phrase of the error message."""
 
 import json
 
@@ -10,7 +10,7 @@ MLP = "train sac-mlp"
 MISTAKES = {
     "trian": "did you mean train?",
     "frobnicate": "no command 'frobnicate'",
-    "train": "No agent is named",
+    "train": "No agent is given",
     "train vmr pendulum-v": "no agent 'vmr': did you mean vrm?",
     "train vrm": "TASK is missing",
     "train vrm pendulm-v": "no task 'pendulm-v': did you mean pendulum-v?",
@@ -57,10 +57,10 @@ MISTAKES = {
     f"{TRAIN} --replay-capacity 10": "replay_capacity=10 is too small: this agent needs at least 2000",
     f"{TRAIN} --out there": "there exists already",
     f"{TRAIN} --out there/file/run": "there/file/run cannot be made",
-    "sweep": "Nothing is named to run",
-    "sweep --agents vrm": "Nothing is named to run",
-    "sweep --out there": "Nothing is named to run",
-    "sweep --out there --steps 5": "Nothing is named to run",
+    "sweep": "There is nothing to run",
+    "sweep --agents vrm": "There is nothing to run",
+    "sweep --out there": "There is nothing to run",
+    "sweep --out there --steps 5": "There is nothing to run",
     "sweep mine.py": "no file mine.py",
     "sweep there/file --agents vrm": "leave --preset, --agents and --tasks out",
     "sweep --preset paper": "--preset must be one of",
@@ -81,13 +81,13 @@ MISTAKES = {
     "sweep --preset classic --tasks pendulum --constants mass=0": "mass=0 is impossible",
     "sweep --preset classic --tasks pendulum --observe 9": "9 is not an index of the observation, which has 3 entries",
     "sweep --preset classic --out there/file": "there/file cannot be made",
-    "figure": "No figure is named: write beliefrl figure KIND RUNS",
+    "figure": "No figure is given: write beliefrl figure KIND RUNS",
     "figure curve": "There is no figure 'curve'",
     "figure curves": "RUNS is missing",
     "figure curves missing": "no folder missing",
     "figure curves missing.json.gz": "no file missing.json.gz",
     "figure curves there": "no run in there",
-    "figure curves untrained": "is finished",
+    "figure curves untrained": "both selected and finished",
     "figure curves untrained --unfinished": "no curve to draw",
     "figure curves untrained --actions best": "--actions must be one of",
     "figure curves untrained --out picture.jpg --unfinished": "no curve to draw",
@@ -135,7 +135,7 @@ MISTAKES = {
     "film untrained --frames 1": "frames=1 is impossible",
     "film untrained --out there": "it is a folder",
     "tasks all": "one argument too many, 'all'",
-    "bench": "No agent is named",
+    "bench": "No agent is given",
     "bench vrm --obs 0": "obs_dim=0 is impossible",
     "bench vrm --actions -1": "action_dim=-1 is impossible",
     "bench vrm --seeds 0": "seeds=0 is impossible",
@@ -161,8 +161,8 @@ MISTAKES = {
     f"{MLP} pendulum --constants dt=0": "dt=0 is impossible: it must be a number from 0.0001 to 1",
     f"{MLP} pendulum --constants max_steps=1.5": "max_steps=1.5 is impossible: it must be a whole number of at least 1",
     f"{MLP} pendulum --constants max_steps=0": "max_steps=0 is impossible",
-    f"{MLP} pendulum --constants name=3": "the task's name and --observe are given apart",
-    f"{MLP} pendulum --constants observe=3": "the task's name and --observe are given apart",
+    f"{MLP} pendulum --constants name=3": "are not constants of a task",
+    f"{MLP} pendulum --constants observe=3": "are not constants of a task",
     f"{MLP} cartpole-v --constants force=inf": "force=inf is impossible",
     f"{MLP} target-reaching --constants rewards=[1,2]": "it must be 3 numbers from -1000 to 1000",
     f"{MLP} target-reaching --constants rewards=1": "rewards=1 is impossible: it must be 3 numbers",
@@ -235,7 +235,7 @@ MISTAKES = {
 
 
 def prepare(folder):
-    """Runs that have something wrong with them."""
+    """Make runs with faulty files in `folder`."""
     config = {
         "agent": "vrm",
         "hyperparameters": {"d_size": 4},

@@ -64,7 +64,7 @@ class TargetReaching:
         """Raise a UserError for impossible values."""
         check_range(self, ("field", "radius", "speed", "axle", "scale"), 0.001, 1000)
         check_range(self, ("target_square",), 0.001, self.field)
-        check_range(self, ("min_squared_gap",), 0, self.target_square**2 / 2)  # else impossible
+        check_range(self, ("min_squared_gap",), 0, self.target_square**2 / 2)  # more does not fit
         check_range(self, ("rewards", "wall_reward"), -1000, 1000)
         check_range(self, ("max_steps",), 1)
 
