@@ -4,8 +4,8 @@
     action, state = policy.predict(obs)                                          # an episode starts
     action, state = policy.predict(obs, reward, state, episode_start=False)      # and continues
 
-The interface follows Stable-Baselines3's recurrent policies. The reward is an additional input, since beliefs depend on
-it.
+The interface follows Stable-Baselines3's recurrent policies, with the reward as an additional input: beliefs depend on
+the rewards.
 """
 
 import functools
@@ -108,8 +108,7 @@ class Policy:
 
         Raises:
             UserError: an input has the wrong shape or type, is not finite as float32, or is so large that the action
-                would
-                not be finite. `state` stays valid.
+                would not be finite. `state` stays valid.
         """
         obs = given = _numbers(obs, "obs")
         single = obs.ndim == 1

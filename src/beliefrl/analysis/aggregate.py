@@ -46,7 +46,7 @@ def profile(scores: Scores, thresholds: Float[np.ndarray, " threshold"]) -> Floa
 def interval(
     statistic: Callable[[Scores], Any], scores: Scores, resamples: int = RESAMPLES, seed: int = 0
 ) -> tuple[Any, Any]:
-    """The ends of the statistic's 95 % interval: percentiles over bootstrap samples, drawn within each task."""
+    """The lower and upper end of a statistic's 95 % interval, by a bootstrap within each task."""
     random = np.random.default_rng(seed)
     drawn = [statistic([random.choice(task, task.size) for task in scores]) for _ in range(resamples)]
     low, high = np.quantile(drawn, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0)

@@ -72,7 +72,7 @@ def find(paths: Sequence[str | os.PathLike[str]], read: Callable[[pathlib.Path],
     A run that cannot be read is left out. `read` makes a run from its folder.
 
     Raises:
-        UserError: a folder or file does not exist, holds no run, or none of the runs can be read.
+        UserError: a path does not exist or contains no run, or none of the runs can be read.
     """
     found: dict[pathlib.Path, Run] = {}
     unreadable: dict[pathlib.Path, str] = {}
@@ -81,7 +81,7 @@ def find(paths: Sequence[str | os.PathLike[str]], read: Callable[[pathlib.Path],
         if path.name.endswith(results.ENDING):
             found |= {run.folder: run for run in results.read(path)}
             continue
-        if not os.path.isdir(path):  # noqa: PTH112 - pathlib's raises where a name is too long
+        if not os.path.isdir(path):  # noqa: PTH112 - pathlib's version raises if a name is too long
             raise UserError(f"There is no folder {path}: give the folder of a run or of a sweep.")
         inside = sorted(config.parent for config in path.rglob("config.json") if (config.parent / "metrics").is_dir())
         if not (inside or (path / "config.json").exists()):

@@ -107,7 +107,7 @@ def _packed(run: Run, usual: Row) -> dict[str, Any]:
     settings = usual | run.config["hyperparameters"]
     own = {name: value for name, value in settings.items() if usual.get(name, missing) != value}
     text = json.dumps(run.config | {"hyperparameters": own})
-    config = json.loads(re.sub(r'"/[^"]*/(runs/[^"]*)"', r'"\1"', text))  # drop the path on this machine
+    config = json.loads(re.sub(r'"/[^"]*/(runs/[^"]*)"', r'"\1"', text))  # cut absolute paths to runs/...
     return {"name": run.folder.name, "config": config, "rows": {seed: _kept_rows(run, seed) for seed in run.seeds}}
 
 

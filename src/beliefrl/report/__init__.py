@@ -1,7 +1,7 @@
 """A report on runs: one HTML page that needs no network and no server.
 
 `data` computes the content; page.html, page.css, curves.js and page.js render it. The content is embedded as JSON. The
-script inserts it as text, never as HTML, because a run's folder may come from somebody untrusted. The page's
+script inserts it as text, never as HTML, because the source of a run's folder may be untrusted. The page's
 Content-Security-Policy enforces this: the browser runs no other script, and loads only pictures and videos from the
 page's own location.
 """

@@ -1,4 +1,4 @@
-"""Any Gymnasium environment as a task: flat and masked observations, actions in [-1, 1], faults as clear messages.
+"""Any Gymnasium environment as a task: flat and masked observations, actions in [-1, 1], and clear messages for faults.
 
 Such a task runs on the host, not in a compiled program (`host_loop`). It has a `spec`, and makes environments whose
 episodes follow the same rules as those of `rollout`. This module checks everything that an environment returns.

@@ -98,7 +98,7 @@ def similar(id: str) -> str | None:
 
 
 def make(id: str, arguments: dict[str, Any], name: str | None = None) -> GymnasiumTask:
-    """The task with a Gymnasium id, `Id` or `package:Id`; imports the package, which registers the environment.
+    """The task with a Gymnasium id, `Id` or `package:Id`; the package is imported, to register the environment.
 
     `arguments` are those of gymnasium.make: max_episode_steps, and the environment's own.
 

@@ -64,7 +64,7 @@ class TargetReaching:
         """Raise a UserError for impossible values."""
         check_range(self, ("field", "radius", "speed", "axle", "scale"), 0.001, 1000)
         check_range(self, ("target_square",), 0.001, self.field)
-        check_range(self, ("min_squared_gap",), 0, self.target_square**2 / 2)  # more does not fit
+        check_range(self, ("min_squared_gap",), 0, self.target_square**2 / 2)  # no larger gap fits
         check_range(self, ("rewards", "wall_reward"), -1000, 1000)
         check_range(self, ("max_steps",), 1)
 
@@ -97,7 +97,7 @@ class TargetReaching:
         return jax.lax.while_loop(too_close, redraw, redraw((key, jnp.zeros((3, 2)))))[1]
 
     def observation(self, state: TargetReachingState) -> Float[Array, "12"]:
-        """Nearness of red, green, blue, of the wall ahead and behind; sin and cos of the bearings; the last reward."""
+        """Nearness of red, green, blue and the walls ahead and behind; sin and cos of the bearings; the last reward."""
         offset = state.targets - state.position[None]
         distance = jnp.sqrt(jnp.sum(offset**2, axis=-1))
         bearing = jnp.arctan2(offset[:, 1], offset[:, 0]) - state.heading
