@@ -1,6 +1,6 @@
 """Compare agents on several tasks and seeds: run a sweep, and write an interactive report.
 
-    python examples/06_many_trainings.py                                # 12 trainings: 40 minutes on two cores
+    python examples/06_many_trainings.py                                # 12 seeds in total: 40 minutes on two cores
     python examples/06_many_trainings.py --steps 300 --seeds 1          # a short test run
     python examples/06_many_trainings.py --ray auto                     # on a Ray cluster
 
@@ -15,7 +15,7 @@ import beliefrl
 
 
 def main(steps: int = 15_000, seeds: int = 3, out: pathlib.Path = pathlib.Path("runs/many"), ray: str = "") -> None:
-    """Train VRM and an agent without memory on the pendulum, without its positions and without its velocity."""
+    """Train VRM and an agent without memory on two pendulums, one without positions, one without velocity."""
     experiments = beliefrl.grid(["vrm", "sac-mlp"], ["pendulum-v", "pendulum-p"], seeds=seeds, steps=steps)
     status = beliefrl.sweep(experiments, out, ray=ray or None, report=print_status)
     print(f"{len(status.finished)} trainings are finished")

@@ -18,11 +18,11 @@ class EvaluateOptions:
     run: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
     episodes: int = 20
-    """Number of episodes for each of the run's seeds, with sampled and with mode actions each."""
+    """Number of episodes for each of the run's seeds and each kind of actions (sampled, mode)."""
     seed: int = 0
     """Random seed of the episodes. The same seed gives the same results."""
     json: bool = False
-    """Print one JSON object, with mean, S.E.M., means of all seeds, and success rates, for both kinds of actions."""
+    """Print one JSON object: for each kind of actions the mean, the S.E.M., the mean of each seed, and success rates."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Types of values on the command line that are parsed or shown differently from tyro's defaults."""
+"""Value types that the command line parses or shows differently from tyro's defaults."""
 
 import dataclasses
 from decimal import Decimal, InvalidOperation

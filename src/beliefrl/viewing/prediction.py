@@ -41,7 +41,7 @@ class Predictions(NamedTuple):
 
     title: str
     entries: tuple[int, ...]  # indices of the observed entries in the task's full observation
-    names: tuple[str, ...]  # of the columns: the task's names of the entries, or "entry 2"; then "reward"
+    names: tuple[str, ...]  # names of the columns: entries of the task, or "entry 2"; then "reward"
     start: int  # the first time step that the closed loop does not observe
     truth: Float[np.ndarray, "time x"]
     open_loop: Gaussian  # leaves (time, x); NaN where nothing is predicted; σ = 0 for a deterministic model
