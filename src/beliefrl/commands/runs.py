@@ -22,7 +22,7 @@ class EvaluateOptions:
     seed: int = 0
     """Random seed of the episodes. The same seed gives the same results."""
     json: bool = False
-    """Print one JSON object: for each kind of actions the mean, the S.E.M., the mean of each seed, and success rates."""
+    """Print one JSON object: for each kind of actions the mean, S.E.M., mean of each seed, and success rates."""
 
 
 @dataclasses.dataclass(frozen=True)
