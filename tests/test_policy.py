@@ -100,7 +100,7 @@ def test_samples_differ_and_come_back_with_their_seed():
         ({"obs": [[0.0, 0.0], [0.0]]}, "obs must be real numbers"),
         ({"obs": [0.0, 0.0], "reward": "1"}, "reward must be real numbers, not '1'"),
         ({"obs": [0.0, 0.0], "reward": (np.zeros((1, 1)), np.zeros((1, 2)))}, "reward must be real numbers"),
-        ({"obs": (np.zeros((1, 8)), np.zeros((1, 9)), np.zeros((1, 9)))}, "obs must be real numbers, not a tuple"),
+        ({"obs": (np.zeros((1, 8)), np.zeros((1, 9)), np.zeros((1, 9)))}, r"obs must be real numbers, not \("),
         ({"obs": [0.0, 0.0], "episode_start": [[1, 0], [1]]}, r"episode_start must be True or False, not \[\[1, 0"),
         ({"obs": [0.0, 0.0], "episode_start": "no"}, "episode_start must be True or False, not 'no'"),
         ({"obs": [0.0, 0.0], "deterministic": 2}, "deterministic must be True or False, not 2"),
