@@ -78,7 +78,7 @@ def environment(sweep: pathlib.Path, slot: Slot) -> dict[str, str]:
 def slots(workers: int | None = None) -> list[Slot]:
     """The slots of this machine: its GPUs if it has any, otherwise its cores.
 
-    With `workers` there are that many slots, but never more than there are GPUs.
+    With `workers` there are that many slots, except that each GPU has at most one.
     """
     gpus = _gpus()
     if gpus:
