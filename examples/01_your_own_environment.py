@@ -1,16 +1,16 @@
-"""Your own environment: anything with Gymnasium's interface, here a cart that must stop at a mark it drives towards.
+"""Train on your own environment, which has Gymnasium's interface: here a cart that must drive to a mark and stop there.
 
     pip install beliefrl
     python examples/01_your_own_environment.py                  # 6,000 steps: about six minutes
-    python examples/01_your_own_environment.py --steps 300      # to see it run
+    python examples/01_your_own_environment.py --steps 300      # a short test run
 
-An environment that is registered needs no Python at all; `my_robots` is the module that registers it:
+A registered environment needs no Python code. Here `my_robots` is a module that registers one:
 
     beliefrl train vrm gym:my_robots:Cart-v0 --observe 0 --seeds 2
     beliefrl train vrm gym:MountainCarContinuous-v0 --observe 0 --constants max_episode_steps=500
 
-Actions arrive in the range of the environment's own Box. Of the observation the agent sees the entries `observe` (here
-`indices`): not the cart's speed, which has to be told from where it was.
+The environment receives actions in the range of its own Box. The agent sees only the entries `--observe` of the
+observation (in Python: `indices`). Here it does not see the cart's speed, and must infer it from past positions.
 """
 
 import gymnasium
@@ -21,19 +21,19 @@ import beliefrl
 
 
 class Cart(gymnasium.Env):
-    """A cart on a track; the force is in newtons, the mark is somewhere else in every episode."""
+    """A cart on a track. The action is a force; the position of the mark changes with every episode."""
 
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float32)  # distance to the mark m, speed m/s
     action_space = gymnasium.spaces.Box(-3.0, 3.0, (1,), np.float32)  # force, N
 
     def reset(self, *, seed=None, options=None):
-        """Somewhere, at rest."""
+        """Start at a random distance, at rest."""
         super().reset(seed=seed)
         self.distance, self.speed = self.np_random.uniform(-2.0, 2.0), 0.0
         return self.observation(), {}
 
     def step(self, action):
-        """A tenth of a second; the reward is how near it is."""
+        """Simulate a tenth of a second. The reward is the negative distance."""
         self.speed += 0.1 * float(action[0])
         self.distance += 0.1 * self.speed
         return self.observation(), -abs(self.distance), False, False, {}
@@ -43,7 +43,7 @@ class Cart(gymnasium.Env):
 
 
 def main(steps: int = 6_000, agent: str = "sac-lstm", out: str = "runs/cart") -> None:
-    """Train without the speed. Episodes have no end of their own, so a time limit of 60 steps is set."""
+    """Train without the speed. The environment never ends an episode, so this sets a time limit of 60 steps."""
     task = beliefrl.GymnasiumTask(Cart, indices=(0,), max_steps=60)
     run = beliefrl.train(agent, task, out, steps=steps, eval_every=1_000)
 
@@ -56,7 +56,7 @@ def main(steps: int = 6_000, agent: str = "sac-lstm", out: str = "runs/cart") ->
         obs, reward, _, _, _ = environment.step(action)
         action, state = policy.predict(obs, reward, state)
         if step % 10 == 9:
-            print(f"after {(step + 1) / 10:.0f} s it is {abs(obs[0]):.2f} m from the mark")
+            print(f"after {(step + 1) / 10:.0f} s the cart is {abs(obs[0]):.2f} m from the mark")
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
-"""Deploying: what a run has learned as a function in your own loop, and as one file that jax alone can load.
+"""Deploy a trained policy: as a function in your own loop, and as one file that jax loads without this library.
 
     pip install beliefrl
     beliefrl train vrm gym:Pendulum-v1 --observe 2 --steps 10000 --out runs/pendulum
     python examples/04_deploying.py runs/pendulum
 
-Numpy goes in and comes out. The recurrent memory is the `state`: pass it to the next call, and say where an episode
-starts. The reward of the last step is an input, as beliefs are formed of it too. A reading that is not a finite number
-is a `beliefrl.UserError` that names the entry; the state is as it was, so a control loop can continue from it.
+Inputs and outputs are numpy arrays. `state` is the recurrent memory: pass it to the next call, or None at the start of
+an episode. The reward of the last step is an input, since the belief depends on it. If a sensor value is not finite,
+`predict` raises a `beliefrl.UserError` that names the entry. The state stays valid, so the control loop can continue.
 """
 
 import pathlib
@@ -20,11 +20,11 @@ import beliefrl
 
 
 def main(run: tyro.conf.Positional[str], episodes: int = 3) -> None:
-    """Play in the environment that the run was trained on; then export, load, and play again."""
+    """Play in the run's environment; then export the policy, load the file, and compare the first actions."""
     policy = beliefrl.load(run)
-    print(policy)  # agent, task, sizes, seed
+    print(policy)  # shows agent, task, sizes, seed
     task = beliefrl.task_of(run)
-    environment = task.environment()  # as the agent saw it: its entries of the observation, actions in [-1, 1]
+    environment = task.environment()  # as in training: only the observed entries, actions in [-1, 1]
     totals = []
     for episode in range(episodes):
         obs, _ = environment.reset(seed=episode)
@@ -38,7 +38,7 @@ def main(run: tyro.conf.Positional[str], episodes: int = 3) -> None:
 
     file = pathlib.Path(run) / "policy.jax"
     policy.export(file)
-    exported = jax.export.deserialize(bytearray(file.read_bytes()))  # needs nothing of this library
+    exported = jax.export.deserialize(bytearray(file.read_bytes()))  # does not need this library
     obs, _ = environment.reset(seed=0)
     state = policy.initial_state(1)  # zeros
     start, seed, deterministic = np.array([True]), np.uint32(0), np.bool_(True)

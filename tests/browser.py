@@ -1,4 +1,4 @@
-"""Headless Chromium, driven by the DevTools protocol over a pipe; needs nothing but a Chromium on the PATH."""
+"""Headless Chromium, controlled by the DevTools protocol over a pipe; it needs only a Chromium on the PATH."""
 
 import base64
 import itertools
@@ -13,12 +13,12 @@ import tempfile
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
-# Chromium reads from the file 3 and writes to 4; a process that becomes it, since a fork would disturb JAX's threads
+# Chromium reads from file 3 and writes to file 4. A new process sets this up, since a fork would disturb JAX's threads
 FROM_3_TO_4 = "import os, sys; [os.dup2(int(sys.argv[i]), i + 2) for i in (1, 2)]; os.execv(sys.argv[3], sys.argv[3:])"
 
 
 class Page:
-    """One page. `console` has its messages and errors, `requests` the addresses that it asked for."""
+    """One page. `console` holds its messages and errors, `requests` the addresses that it requested."""
 
     def __init__(self, path, width=1280, height=900, mobile=False, scheme="light"):
         read, self._to = os.pipe()
@@ -91,11 +91,11 @@ class Page:
         return result["result"].get("value")
 
     def frame(self):
-        """Wait until the page has been drawn anew."""
+        """Wait until the page has been redrawn."""
         self.run("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done())))")
 
     def hover(self, selector, right=0.5):
-        """Move the mouse to a part of the width of an element, half its height."""
+        """Move the mouse over an element, to a fraction of its width and half its height."""
         box = f"document.querySelector({json.dumps(selector)})"
         self.run(f"{box}.scrollIntoView({{block: 'center'}})")
         at = self.run(f"(() => {{const b = {box}.getBoundingClientRect(); return [b.x, b.y, b.width, b.height]}})()")
@@ -103,7 +103,7 @@ class Page:
         self.frame()
 
     def screenshot(self, path, whole=True):
-        """A picture of the page from top to bottom."""
+        """A screenshot of the whole page."""
         self.frame()
         picture = self._ask("Page.captureScreenshot", captureBeyondViewport=whole)
         pathlib.Path(path).write_bytes(base64.b64decode(picture["data"]))

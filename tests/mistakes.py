@@ -1,4 +1,4 @@
-"""What users type and find that is wrong, and a phrase of the one sentence that each of it ends with."""
+"""Mistakes of users on the command line, each with a phrase of the error message."""
 
 import json
 
@@ -10,7 +10,7 @@ MLP = "train sac-mlp"
 MISTAKES = {
     "trian": "did you mean train?",
     "frobnicate": "no command 'frobnicate'",
-    "train": "No agent is named",
+    "train": "No agent is given",
     "train vmr pendulum-v": "no agent 'vmr': did you mean vrm?",
     "train vrm": "TASK is missing",
     "train vrm pendulm-v": "no task 'pendulm-v': did you mean pendulum-v?",
@@ -57,10 +57,10 @@ MISTAKES = {
     f"{TRAIN} --replay-capacity 10": "replay_capacity=10 is too small: this agent needs at least 2000",
     f"{TRAIN} --out there": "there exists already",
     f"{TRAIN} --out there/file/run": "there/file/run cannot be made",
-    "sweep": "Nothing is named to run",
-    "sweep --agents vrm": "Nothing is named to run",
-    "sweep --out there": "Nothing is named to run",
-    "sweep --out there --steps 5": "Nothing is named to run",
+    "sweep": "There is nothing to run",
+    "sweep --agents vrm": "There is nothing to run",
+    "sweep --out there": "There is nothing to run",
+    "sweep --out there --steps 5": "There is nothing to run",
     "sweep mine.py": "no file mine.py",
     "sweep there/file --agents vrm": "leave --preset, --agents and --tasks out",
     "sweep --preset paper": "--preset must be one of",
@@ -76,18 +76,18 @@ MISTAKES = {
     "sweep --preset classic --set gama=1": "no hyperparameter 'gama': did you mean gamma?",
     "sweep --preset classic --set seeds=3": "seeds cannot be a setting of a sweep",
     "sweep --preset classic --set gamma=0.9,7": "gamma=7.0 is impossible",
-    "sweep --preset classic --set steps=10,20": "only hyperparameters can be varied",
+    "sweep --preset classic --set steps=10,20": "only hyperparameters can have several values",
     "sweep --preset classic --constants wheels=3": "no constant 'wheels'",
     "sweep --preset classic --tasks pendulum --constants mass=0": "mass=0 is impossible",
     "sweep --preset classic --tasks pendulum --observe 9": "9 is not an index of the observation, which has 3 entries",
     "sweep --preset classic --out there/file": "there/file cannot be made",
-    "figure": "No figure is named: write beliefrl figure KIND RUNS",
+    "figure": "No figure is given: write beliefrl figure KIND RUNS",
     "figure curve": "There is no figure 'curve'",
     "figure curves": "RUNS is missing",
     "figure curves missing": "no folder missing",
     "figure curves missing.json.gz": "no file missing.json.gz",
     "figure curves there": "no run in there",
-    "figure curves untrained": "is finished",
+    "figure curves untrained": "both selected and finished",
     "figure curves untrained --unfinished": "no curve to draw",
     "figure curves untrained --actions best": "--actions must be one of",
     "figure curves untrained --out picture.jpg --unfinished": "no curve to draw",
@@ -122,8 +122,8 @@ MISTAKES = {
     "video untrained": "FILE is missing",
     "video missing film.gif": "no run folder missing",
     "video untrained film.gif": "untrained has no trained agent yet",
-    "video untrained film": "end its name as .mp4 or .gif",
-    "video untrained film.avi": "end its name as .mp4 or .gif",
+    "video untrained film": "must end in .mp4 or .gif",
+    "video untrained film.avi": "must end in .mp4 or .gif",
     "video untrained nowhere/film.gif": "there is no folder nowhere",
     "video untrained film.gif --episodes 0": "episodes=0 is impossible",
     "video untrained film.gif --fps 0": "fps=0.0 is impossible",
@@ -135,7 +135,7 @@ MISTAKES = {
     "film untrained --frames 1": "frames=1 is impossible",
     "film untrained --out there": "it is a folder",
     "tasks all": "one argument too many, 'all'",
-    "bench": "No agent is named",
+    "bench": "No agent is given",
     "bench vrm --obs 0": "obs_dim=0 is impossible",
     "bench vrm --actions -1": "action_dim=-1 is impossible",
     "bench vrm --seeds 0": "seeds=0 is impossible",
@@ -144,7 +144,7 @@ MISTAKES = {
     f"{TRAIN} --keep-checkpoints 0": "keep_checkpoints=0 is impossible",
     f"{TRAIN} --observe 1": "give indices from 0 to 0",
     f"{TRAIN} --observe -1": "-1 is not an index of the observation, which has 1 entry",
-    f"{TRAIN} --observe velocities": "does not say which of its observations are velocities",
+    f"{TRAIN} --observe velocities": "does not define which entries are velocities",
     f"{MLP} pendulum --observe 3": "give indices from 0 to 2",
     f"{MLP} pendulum --observe 99": "99 is not an index of the observation, which has 3 entries",
     f"{MLP} pendulum --observe 1 1": "observe=1 1 has the index 1 twice",
@@ -161,8 +161,8 @@ MISTAKES = {
     f"{MLP} pendulum --constants dt=0": "dt=0 is impossible: it must be a number from 0.0001 to 1",
     f"{MLP} pendulum --constants max_steps=1.5": "max_steps=1.5 is impossible: it must be a whole number of at least 1",
     f"{MLP} pendulum --constants max_steps=0": "max_steps=0 is impossible",
-    f"{MLP} pendulum --constants name=3": "the task's name and --observe are given apart",
-    f"{MLP} pendulum --constants observe=3": "the task's name and --observe are given apart",
+    f"{MLP} pendulum --constants name=3": "are not constants of a task",
+    f"{MLP} pendulum --constants observe=3": "are not constants of a task",
     f"{MLP} cartpole-v --constants force=inf": "force=inf is impossible",
     f"{MLP} target-reaching --constants rewards=[1,2]": "it must be 3 numbers from -1000 to 1000",
     f"{MLP} target-reaching --constants rewards=1": "rewards=1 is impossible: it must be 3 numbers",
@@ -209,7 +209,7 @@ MISTAKES = {
     "report unlogged": "unlogged/metrics/seed-0.jsonl cannot be read",
     "figure curves broken": "broken/config.json cannot be read",
     "figure table crowded": "seeds=1000000000 is impossible",
-    "report untrained -o page.txt": "call it page.html",
+    "report untrained -o page.txt": "page.txt must end in .html",
     "report untrained --out missing/page.html": "no folder missing",
     "report untrained -o": "-o/--out needs a value",
     "report untrained --unfinshed": "did you mean --unfinished?",
@@ -235,7 +235,7 @@ MISTAKES = {
 
 
 def prepare(folder):
-    """Runs that have something wrong with them."""
+    """Make runs with faulty files in `folder`."""
     config = {
         "agent": "vrm",
         "hyperparameters": {"d_size": 4},

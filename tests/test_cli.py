@@ -1,4 +1,4 @@
-"""The command line: what it lists, and what it says of mistakes."""
+"""The command line: its lists, and its messages for mistakes."""
 
 import contextlib
 import importlib.metadata
@@ -15,7 +15,7 @@ ROBOTS = {name + mask for name in ("hopper", "walker2d", "ant", "halfcheetah") f
 
 
 def printed(capsys, line):
-    """What a command prints that ends well and complains of nothing."""
+    """The output of a command that succeeds without messages on stderr."""
     with contextlib.suppress(SystemExit):
         cli.main(line.split())
     out, err = capsys.readouterr()
@@ -48,7 +48,7 @@ def test_version(capsys):
 
 @pytest.fixture
 def folders(tmp_path, monkeypatch):
-    """A working directory with runs that have something wrong with them, where no training can begin."""
+    """A working directory with faulty runs, in which a training must not start."""
     prepare(tmp_path)
 
     def begin(*_, **__):
@@ -60,7 +60,7 @@ def folders(tmp_path, monkeypatch):
 
 
 def complaint(capsys, argv):
-    """The one sentence that a mistake ends with."""
+    """The error message of a mistake, which is one line."""
     with pytest.raises(SystemExit) as end:
         cli.main(argv)
     out, err = capsys.readouterr()

@@ -1,4 +1,4 @@
-"""The examples run as they stand, with fewer steps; the new agent of one of them learns."""
+"""The examples run unchanged, with fewer steps."""
 
 import os
 import pathlib
@@ -11,7 +11,7 @@ EXAMPLES = pathlib.Path(__file__).parent.parent / "examples"
 FEW = {
     "00_quick_start.py": (["--steps", "300", "--seeds", "1"], "return with mode actions"),
     "01_your_own_environment.py": (["--steps", "300"], "m from the mark"),
-    "02_a_task_in_jax.py": (["--steps", "300"], "return of each seed"),
+    "02_a_task_in_jax.py": (["--steps", "300"], "return per seed"),
     "03_a_new_agent.py": (["--steps", "300"], "seed 1: return at each evaluation {300:"),
     "06_many_trainings.py": (["--steps", "300", "--seeds", "1"], "4 trainings are finished"),
     "05_train_elsewhere.py": (["--steps", "1024", "--episodes", "1"], "Return after 1024 steps"),
@@ -19,7 +19,7 @@ FEW = {
 
 
 def output(folder, *command):
-    """What a program prints; it must end well."""
+    """The output of a program, which must succeed."""
     environment = os.environ | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1", "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
         [sys.executable, *map(str, command)], cwd=folder, env=environment, capture_output=True, text=True, timeout=500

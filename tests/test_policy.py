@@ -1,4 +1,4 @@
-"""A trained policy: the agent's own actions, in numpy; and its export, which jax alone can load."""
+"""A trained policy: it acts like the agent, in numpy; its export runs with jax alone."""
 
 import inspect
 import subprocess
@@ -26,14 +26,14 @@ TASK = tasks.make("pendulum-p", max_steps=4)
 
 
 def trained(name):
-    """A small agent and a state of it."""
+    """A small agent, and one of its states."""
     agent = agents.make(name, policy_layers=(8,), value_layers=(8,), **SMALL[name])
     return agent, jax.jit(lambda key: agent.init(key, TASK.spec))(jax.random.key(0))
 
 
 @pytest.mark.parametrize("name", SMALL)
 def test_it_acts_as_the_agent_does_through_episodes(name):
-    """Two episodes in one batch, of which one begins anew while the other goes on: mode actions, moment by moment."""
+    """Two episodes in one batch, one of which restarts while the other continues: mode actions at every step."""
     agent, state = trained(name)
     policy = Policy(agent, TASK.spec, state)
     move = jax.jit(lambda actor: rollout.move(agent, TASK, state, actor, jax.random.key(1), jnp.array(False)))
@@ -45,7 +45,7 @@ def test_it_acts_as_the_agent_does_through_episodes(name):
         steps = [actor.step for actor in actors]
         parts = ("obs", "reward", "is_first")
         obs, reward, first = (np.stack([getattr(step, part) for step in steps]) for part in parts)
-        # the reward is ignored where an episode begins
+        # the reward is ignored at the start of an episode
         action, memory = policy.predict(obs, np.where(first, 7.0, reward), memory, first)
         actors = [move(actor)[0] for actor in actors]
         np.testing.assert_allclose(action, np.stack([actor.step.prev_action for actor in actors]), rtol=1e-5, atol=1e-6)
@@ -92,7 +92,7 @@ def test_samples_differ_and_come_back_with_their_seed():
         ({"obs": [True, False]}, r"obs must be real numbers, not \[True, False\]"),
         ({"obs": np.array([0.0, 0.0], object)}, "obs must be real numbers, not array"),
         ({"obs": None}, "obs is None"),
-        ({"obs": np.zeros((0, 2))}, "obs has no episode in it"),
+        ({"obs": np.zeros((0, 2))}, "obs has no episodes"),
         ({"obs": [0.0, 0.0], "reward": None}, "reward is None: give finite numbers"),
         ({"obs": [0.0, 0.0], "reward": True}, "reward must be real numbers, not True"),
         ({"obs": [0.0, 0.0], "state": 1.0}, "state is not one of this policy for 1 episode"),
@@ -100,7 +100,7 @@ def test_samples_differ_and_come_back_with_their_seed():
         ({"obs": [[0.0, 0.0], [0.0]]}, "obs must be real numbers"),
         ({"obs": [0.0, 0.0], "reward": "1"}, "reward must be real numbers, not '1'"),
         ({"obs": [0.0, 0.0], "reward": (np.zeros((1, 1)), np.zeros((1, 2)))}, "reward must be real numbers"),
-        ({"obs": (np.zeros((1, 8)), np.zeros((1, 9)), np.zeros((1, 9)))}, r"obs must be real numbers, not \(array"),
+        ({"obs": (np.zeros((1, 8)), np.zeros((1, 9)), np.zeros((1, 9)))}, r"obs must be real numbers, not \("),
         ({"obs": [0.0, 0.0], "episode_start": [[1, 0], [1]]}, r"episode_start must be True or False, not \[\[1, 0"),
         ({"obs": [0.0, 0.0], "episode_start": "no"}, "episode_start must be True or False, not 'no'"),
         ({"obs": [0.0, 0.0], "deterministic": 2}, "deterministic must be True or False, not 2"),

@@ -1,4 +1,4 @@
-"""Runs written by hand, to be read by what is drawn and told of them."""
+"""Folders of runs that are written by hand, as input for figures, tables and reports."""
 
 import json
 
@@ -34,7 +34,7 @@ def a_folder(
 
 
 def a_run(folder, seeds, steps=None, settings=None, updates=(), **rest):
-    """The run in such a folder; it is finished, unless it has `steps` that none of its seeds has reached."""
+    """The run in such a folder. It is finished, unless `steps` is higher than its last evaluation."""
     last = max((rows[-1][0] for rows in seeds if rows), default=1)
     steps = last if steps is None else steps
     return Run(a_folder(folder, seeds, steps=steps, hyperparameters=settings or {}, updates=updates, **rest))

@@ -1,4 +1,4 @@
-"""Environments that do what none may do, one for each way of going wrong."""
+"""Faulty environments, one for each kind of fault."""
 
 import os
 import signal
@@ -13,7 +13,7 @@ IMAGE = spaces.Box(0, 255, (64, 64, 3), np.uint8)
 
 
 class Fine(gymnasium.Env):
-    """Nothing wrong: two numbers are observed, one is done, an episode has ten steps."""
+    """A correct environment: two numbers in the observation, one in the action, ten steps per episode."""
 
     observation_space = BOX
     action_space = spaces.Box(-2.0, 6.0, (1,), np.float32)
@@ -43,7 +43,7 @@ class Fine(gymnasium.Env):
 
 
 def when(late, now):
-    """A method that gives `now()` at the third step of an episode and `late` as usual before."""
+    """A method that calls `now` at the third step of an episode, and the usual method `late` otherwise."""
 
     def method(self):
         return now(self) if self.time == 3 else late(self)
@@ -112,7 +112,7 @@ def spaced(**given):
     return type("Fine", (Fine,), given)
 
 
-UNSUPPORTED = {  # what is made: a word of the sentence
+UNSUPPORTED = {  # environment: a phrase of the message
     spaced(action_space=spaces.Discrete(3)): "not discrete",
     spaced(action_space=spaces.Dict({"a": BOX})): "not discrete or composite",
     spaced(action_space=spaces.Box(-np.inf, np.inf, (1,), np.float32)): "unbounded",
@@ -126,52 +126,52 @@ UNSUPPORTED = {  # what is made: a word of the sentence
     spaced(observation_space=spaces.Dict({"arm": BOX, "camera": IMAGE})): "uint8) at ['camera'])",
     spaced(observation_space=spaces.Tuple([BOX, spaces.Dict({"eye": IMAGE})])): "uint8) at [1]['eye'])",
     spaced(observation_space=spaces.Text(20)): "has the observations Text",
-    spaced(observation_space=spaces.Dict({"arm": BOX, "word": spaces.Text(20)})): "at ['word']: what is supported",
-    spaced(observation_space=spaces.Tuple([BOX, spaces.Sequence(BOX)])): "at [1]: what is supported",
+    spaced(observation_space=spaces.Dict({"arm": BOX, "word": spaces.Text(20)})): "at ['word']: only Box",
+    spaced(observation_space=spaces.Tuple([BOX, spaces.Sequence(BOX)])): "at [1]: only Box",
     spaced(observation_space=spaces.Box(-1.0, 1.0, (5000,), np.float32)): "an observation of 5,000 numbers",
     spaced(observation_space=spaces.Dict({"arm": BOX, "cell": spaces.Discrete(10**6)})): "of 1,000,002 numbers",
     spaced(observation_space=spaces.Dict({})): "without numbers",
     spaced(observation_space=spaces.Graph(BOX, None)): "has the observations Graph",
-    spaced(observation_space=spaces.Sequence(BOX)): "what flattens to one",
+    spaced(observation_space=spaces.Sequence(BOX)): "and Dict and Tuple of these",
     spaced(observation_space=spaces.Box(-1.0, 1.0, (0,), np.float32)): "without numbers",
     spaced(observation_space=None): "observations None",
     spaced(__init__=failing_init): "OSError: cannot open /dev/robot",
     lambda: None: "robot has the actions None",
 }
 
-FAULTS = {  # what is made: (a phrase of the sentence, the step that it names)
+FAULTS = {  # environment: (a phrase of the message, the step that it names)
     raising(ZeroDivisionError("division by zero")): ("step raised ZeroDivisionError: division by zero", 3),
     raising(RuntimeError("100 %\n  of two lines\n")): ("step raised RuntimeError: 100 % of two lines", 3),
     raising(AssertionError()): ("step raised AssertionError", 3),
     with_step(lambda self, result: sys.exit("bye")): ("step raised SystemExit: bye", 3),
-    with_step(lambda self, result: result[:2] + result[3:]): ("step returned no five", 3),
-    with_step(lambda self, result: None): ("step returned no five", 3),
+    with_step(lambda self, result: result[:2] + result[3:]): ("step did not return", 3),
+    with_step(lambda self, result: None): ("step did not return", 3),
     with_step(changing): ("its action space changed from Box(-2.0, 6.0", 3),
     with_observation(np.array([0.0, np.nan])): ("entry 1 of the observation is nan", 3),
     with_observation(np.array([np.inf, 0.0])): ("entry 0 of the observation is inf", 3),
     with_observation(np.array([1e300, 0.0])): ("entry 0 of the observation is 1e+300", 3),
     with_observation(np.array([0.0, -202.0])): ("entry 1 of the observation is -202.0, far outside its space", 3),
     with_observation(np.array([1e6, 0.0])): ("which says -1.0 to 1.0: correct the observation", 3),
-    with_observation(np.zeros(3)): ("the observation has shape (3,), where its space says (2,)", 3),
+    with_observation(np.zeros(3)): ("the observation has shape (3,), but its space says (2,)", 3),
     with_observation(np.zeros((1, 2))): ("the observation has shape (1, 2)", 3),
     with_observation(0.5): ("the observation has shape ()", 3),
-    with_observation(np.array(["left", "right"])): ("the observation is of type <U5", 3),
-    with_observation(np.zeros(2, complex)): ("the observation is of type complex128", 3),
-    with_observation([[1.0], [2.0, 3.0]]): ("the observation is of type object", 3),
-    with_observation(None): ("the observation is of type object", 3),
+    with_observation(np.array(["left", "right"])): ("the observation has type <U5", 3),
+    with_observation(np.zeros(2, complex)): ("the observation has type complex128", 3),
+    with_observation([[1.0], [2.0, 3.0]]): ("the observation has type object", 3),
+    with_observation(None): ("the observation has type object", 3),
     Dictionary: ("the observation does not fit its space Dict", 3),
     with_reward(float("nan")): ("the reward is nan", 3),
     with_reward(float("inf")): ("the reward is inf", 3),
     with_reward(-1e200): ("the reward is -1e+200", 3),
-    with_reward(np.ones(1)): ("the reward is of shape (1,), where it must be one number", 3),
+    with_reward(np.ones(1)): ("the reward is of shape (1,), but must be one number", 3),
     with_reward(None): ("the reward is None", 3),
     with_reward("much"): ("the reward is 'much'", 3),
-    with_end(None, False): ("terminated is None, where it must be True or False", 3),
+    with_end(None, False): ("terminated is None, but must be True or False", 3),
     with_end(False, "soon"): ("truncated is 'soon'", 3),
     with_end(2, False): ("terminated is 2", 3),
     Endless: ("the episode has not ended after 25 steps", 25),
     spaced(reset=failing_reset): ("reset raised RuntimeError: no robot is connected", 0),
-    reset_of(np.zeros(2, np.float32)): ("reset returned no pair", 0),
+    reset_of(np.zeros(2, np.float32)): ("reset did not return", 0),
     reset_of((np.full(2, np.nan), {})): ("entry 0 of the observation is nan", 0),
 }
 

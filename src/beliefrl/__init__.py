@@ -1,4 +1,4 @@
-"""BeliefRL: reinforcement learning for agents that do not see the whole state.
+"""BeliefRL: recurrent reinforcement learning under partial observability.
 
 import beliefrl
 

@@ -1,10 +1,11 @@
-"""A trained policy to deploy: numpy in and out, many at once, and an export that needs none of this library.
+"""A trained policy for deployment: numpy in and out, batched, with an export that runs without this library.
 
     policy = beliefrl.load("runs/first")
-    action, state = policy.predict(obs)                                          # an episode begins
-    action, state = policy.predict(obs, reward, state, episode_start=False)      # and goes on
+    action, state = policy.predict(obs)                                          # an episode starts
+    action, state = policy.predict(obs, reward, state, episode_start=False)      # and continues
 
-In the manner of Stable-Baselines3's recurrent policies; the reward is one input more, as beliefs are formed of it.
+The interface follows Stable-Baselines3's recurrent policies, with the reward as an additional input: beliefs depend on
+the rewards.
 """
 
 import functools
@@ -32,28 +33,28 @@ State = tuple[np.ndarray, ...]
 
 
 class Policy:
-    """What a training has learned, as a function from perceptions to actions."""
+    """A trained agent as a function from observations and rewards to actions."""
 
     def __init__(self, agent: Agent, spec: Spec, state: Any, seed: int = 0, precision: str = "float32", task: str = ""):
-        """One trained state of an agent.
+        """Make a policy of an agent and one of its trained states.
 
-        `seed` is the random seed of sampled actions, `precision` that of matrix products (`Run.precision`), `task` a
-        name to show.
+        `seed` is the random seed of sampled actions, `precision` that of matrix products (`Run.precision`), and `task`
+        a name for `repr`.
         """
         self.agent, self.spec, self.seed, self.precision, self.task = agent, spec, seed, precision, task
         self._state = jax.device_put(state)
-        self._empty = jax.device_get(agent.reset(spec))  # the memory in which an episode begins
+        self._empty = jax.device_get(agent.reset(spec))  # the memory at the start of an episode
         self._act = jax.jit(lambda *inputs: self._step(self._state, *inputs))
         self._calls = 0
 
     def __repr__(self) -> str:
-        """Agent, task, sizes, seed: `<Policy vrm on pendulum-v: observation (1,), action (1,), seed 0>`."""
+        """The agent, task, sizes and seed: `<Policy vrm on pendulum-v: observation (1,), action (1,), seed 0>`."""
         sizes = f"observation ({self.spec.obs_dim},), action ({self.spec.action_dim},)"
         on = f" on {self.task}" if self.task else ""
         return f"<Policy {agents.name_of(self.agent)}{on}: {sizes}, seed {self.seed}>"
 
     def _step(self, agent_state, obs, reward, state, episode_start, seed, deterministic):
-        """Act for a batch; `state` is the leaves of the memory and the action before, leaves (batch, ...)."""
+        """Act for a batch. `state` holds the leaves of the memory and the previous action, each (batch, ...)."""
         *memory, prev_action = state
         memory = jax.tree.structure(self._empty).unflatten(memory)
         memory = jax.tree.map(functools.partial(_where_first, episode_start), self._empty, memory)
@@ -75,10 +76,10 @@ class Policy:
         return action, (*jax.tree.leaves(memory), action)
 
     def initial_state(self, batch: int) -> State:
-        """The state in which `batch` episodes begin: the agent's empty memory, and no action before.
+        """The state at the start of `batch` episodes: the agent's empty memory and a zero previous action.
 
         Raises:
-            UserError: `batch` is no whole number of at least 1.
+            UserError: `batch` is not a whole number of at least 1.
         """
         if not isinstance(batch, Integral) or batch < 1:
             raise UserError(f"batch={short(batch)} is impossible: it must be a whole number of at least 1.")
@@ -93,21 +94,21 @@ class Policy:
         episode_start: Any = None,
         deterministic: Any = True,
     ) -> tuple[np.ndarray, State]:
-        """Perceive one moment of one or many episodes, and act.
+        """Take the next observation of one or many episodes, and choose an action.
 
         Args:
             obs: o_t, (obs,) or (batch, obs).
-            reward: r_{t-1} that came with it, a number or (batch,); ignored where an episode begins.
-            state: what the last call returned; None where all episodes begin.
-            episode_start: whether an episode begins with this moment, a bool or (batch,); None: where `state` is None.
-            deterministic: a bool; True is the policy's mode, False a sample.
+            reward: r_{t-1}, which came with `obs`, a number or (batch,); ignored at the start of an episode.
+            state: the state that the previous call returned; None at the start of all episodes.
+            episode_start: whether an episode starts with `obs`, a bool or (batch,); None: True if `state` is None.
+            deterministic: True takes the policy's mode, False samples the action.
 
         Returns:
             The action in [-1, 1], (action,) or (batch, action), and the state for the next call.
 
         Raises:
-            UserError: an input of another shape or type, or one that is not finite as float32; or one that is so large
-                that the action is not finite. `state` is as good as before.
+            UserError: an input has the wrong shape or type, is not finite as float32, or is so large that the action
+                would not be finite. `state` stays valid.
         """
         obs = given = _numbers(obs, "obs")
         single = obs.ndim == 1
@@ -117,10 +118,10 @@ class Policy:
             raise UserError(f"obs has the shape {obs.shape[single:]}: it must be ({size},) or (batch, {size}).")
         batch = len(obs)
         if not batch:
-            raise UserError("obs has no episode in it: give one or more.")
-        begins = _flags(state is None if episode_start is None else episode_start, batch, "episode_start")
+            raise UserError("obs has no episodes: give one or more.")
+        starts = _flags(state is None if episode_start is None else episode_start, batch, "episode_start")
         reward = _each(_numbers(reward, "reward"), batch, "reward")
-        reward = np.where(begins, 0, reward)
+        reward = np.where(starts, 0, reward)
         _check_finite(given, "obs")
         _check_finite(reward.reshape(() if single else batch), "reward")
         state = self.initial_state(batch) if state is None else self._fitting(state, batch)
@@ -128,7 +129,7 @@ class Policy:
         self._calls += 1
         seed = np.uint32((self.seed * 1_000_003 + self._calls) % (LARGEST + 1))
         obs, reward = obs.astype(np.float32), reward.astype(np.float32)
-        action, after = jax.device_get(self._act(obs, reward, state, begins, seed, mode))
+        action, after = jax.device_get(self._act(obs, reward, state, starts, seed, mode))
         finite = np.all([np.isfinite(leaf.reshape(batch, -1)).all(axis=1) for leaf in after], axis=0)
         for episode in np.flatnonzero(~finite):
             which = "" if single else f" of episode {episode}"
@@ -136,13 +137,13 @@ class Policy:
         return (action[0] if single else action), after
 
     def _fitting(self, state: Any, batch: int) -> State:
-        """The same state, once it is sure to be one of this policy for so many episodes."""
+        """The same state, after a check that it is a state of this policy for `batch` episodes."""
         wanted = [(leaf.shape, leaf.dtype) for leaf in self.initial_state(batch)]
         leaves = list(state) if isinstance(state, tuple | list) else []
         if [(np.shape(leaf), getattr(leaf, "dtype", None)) for leaf in leaves] != wanted:
             raise UserError(
                 f"state is not one of this policy for {_count(batch, 'episode')}: give the second result of `predict`, "
-                "or None where all episodes begin."
+                "or None at the start of all episodes."
             )
         for leaf in leaves:
             if np.issubdtype(leaf.dtype, np.floating) and not np.isfinite(leaf).all():
@@ -150,14 +151,14 @@ class Policy:
         return tuple(leaves)
 
     def export(self, path: str | os.PathLike[str]) -> None:
-        """Write the policy as one file that jax loads without this library, for any batch, on CPUs and NVIDIA GPUs.
+        """Write the policy to a file that jax loads without this library, for any batch size, for CPUs and NVIDIA GPUs.
 
             policy = jax.export.deserialize(pathlib.Path("policy.jax").read_bytes())
             action, state = policy.call(obs, reward, state, episode_start, seed, deterministic)
 
-        takes obs (batch, obs), reward and episode_start (batch,) as `predict` does, a uint32 seed of the sampled
-        actions, and a bool. The shapes of the first state are in `policy.in_avals`; zeros will do, since the state
-        counts only where episode_start is False. Loading needs the package flatbuffers beside jax.
+        takes obs (batch, obs), and reward and episode_start (batch,), as in `predict`; a uint32 seed for sampled
+        actions; and a bool. `policy.in_avals` has the shapes of the state. The first state may be zeros, since the
+        state is ignored where episode_start is True. Loading needs the packages jax and flatbuffers.
 
         Raises:
             UserError: the file cannot be written.
@@ -185,16 +186,16 @@ def load(
     task: Task | GymnasiumTask | None = None,
     agent: Agent | type | None = None,
 ) -> Policy:
-    """The policy that a run has learned.
+    """Load the trained policy of a run.
 
     Args:
         run: a run, or its folder.
-        seed: which of the run's seeds; None is its first.
-        task: needed only where the run was trained on a task of your own.
-        agent: needed only where an agent of your own was trained: its class, or one of them.
+        seed: one of the run's seeds; None: its first.
+        task: needed only if the run was trained on a task of your own.
+        agent: needed only if the run was trained by an agent of your own: its class, or an instance.
 
     Raises:
-        UserError: there is no such run, nothing was saved in it, or it has no such seed.
+        UserError: there is no such run or seed, or the run has no trained agent yet.
     """
     run = run if isinstance(run, Run) else Run(run)
     trained, found, state, precision = restore_seed(run, seed, task, agent)
@@ -203,10 +204,10 @@ def load(
 
 
 def _numbers(value: Any, name: str) -> np.ndarray:
-    """What was given for obs or reward as an array of real numbers.
+    """The value of obs or reward as an array of real numbers.
 
     Raises:
-        UserError: something in it is no number.
+        UserError: an entry is not a number.
     """
     array = _array(value)
     for index, entry in np.ndenumerate(array if array.dtype == object else ()):
@@ -218,15 +219,15 @@ def _numbers(value: Any, name: str) -> np.ndarray:
 
 
 def _array(value: Any) -> np.ndarray:
-    """Any value as an array; one of no entries where it is none."""
+    """The value as an array; an empty array if it cannot be one."""
     try:
         return np.asarray(value)
-    except Exception:  # rows of different lengths, or whatever a stranger's class may raise
+    except Exception:  # rows of different lengths, or an error of the value's class
         return np.empty(0, object)
 
 
 def _flags(value: Any, batch: int, name: str) -> np.ndarray:
-    """True or False for each episode of a batch."""
+    """One bool for each episode of a batch."""
     array = _array(value)
     if array.dtype.kind not in "biu" or not np.isin(array, (0, 1)).all():
         raise UserError(f"{name} must be True or False, not {short(value)}.")
@@ -234,14 +235,14 @@ def _flags(value: Any, batch: int, name: str) -> np.ndarray:
 
 
 def _each(array: np.ndarray, batch: int, name: str) -> np.ndarray:
-    """An entry for each episode of a batch."""
+    """One entry for each episode of a batch."""
     if array.shape not in ((), (batch,)):
         raise UserError(f"{name} has the shape {array.shape}: it must be one number or ({batch},).")
     return np.broadcast_to(array, (batch,))
 
 
 def _check_finite(array: np.ndarray, name: str) -> None:
-    """Raise a UserError that names the first entry that is not finite as float32."""
+    """Raise a UserError that names the first entry which is not finite as float32."""
     with np.errstate(over="ignore"):
         wrong = ~np.isfinite(array.astype(np.float32))
     for index in map(tuple, np.argwhere(wrong).tolist()):
@@ -249,14 +250,14 @@ def _check_finite(array: np.ndarray, name: str) -> None:
 
 
 def _place(name: str, index: tuple[int, ...]) -> str:
-    """An entry in words: `index` is (entry,) or (episode, entry) of obs, () or (episode,) of reward."""
+    """The position of an entry as text; `index` is (entry,) or (episode, entry) of obs, () or (episode,) of reward."""
     *episode, entry = index if name == "obs" and index else (*index, None)
     which = name if entry is None else f"entry {entry} of {name}"
     return f"{which} of episode {episode[0]}" if episode else which
 
 
 def _where_first(is_first: Any, empty: Any, leaf: Any) -> Any:
-    """`empty` for those of a batch whose episode begins, else `leaf`; leaves (batch, ...)."""
+    """`empty` for the episodes that start, `leaf` for the others; leaves (batch, ...)."""
     return jnp.where(is_first.reshape(-1, *[1] * (leaf.ndim - 1)), empty, leaf)
 
 

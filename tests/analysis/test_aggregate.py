@@ -23,13 +23,13 @@ def test_a_profile_is_the_fraction_of_runs_above_each_score():
 
 
 def test_seeds_are_drawn_anew_within_each_task():
-    """Tasks that differ and seeds that do not: nothing varies if, and only if, every task keeps its weight."""
+    """Scores differ between tasks, not seeds: the interval has zero width only if each task keeps its weight."""
     low, high = interval(lambda drawn: np.mean(np.concatenate(drawn)), [np.zeros(3), np.ones(3)])
     assert low == high == 0.5
 
 
 def test_an_interval_covers_the_truth_as_often_as_it_says():
-    """Of 200 draws of 40 numbers the mean's interval misses 0 in about 5 %; over 11 % is out of question."""
+    """Of 200 samples of 40 numbers, the mean's interval misses 0 in about 5 %; over 11 % is all but impossible."""
     random = np.random.default_rng(1)
     missed = 0
     for _ in range(200):

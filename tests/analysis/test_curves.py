@@ -1,4 +1,4 @@
-"""Learning curves, read off a run's folder that was written by hand."""
+"""Learning curves of a run whose files are written by hand."""
 
 import json
 
@@ -11,7 +11,7 @@ from beliefrl.types import UserError
 
 
 def a_run(folder, seeds, success=False):
-    """A folder with these rows of each seed: (step, returns with sampled actions)."""
+    """A run's folder with these evaluations of each seed: (step, returns with sampled actions)."""
     (folder / "metrics").mkdir()
     options = {"seed": 0, "seeds": len(seeds)}
     config = {"agent": "vrm", "hyperparameters": {}, "task": "pendulum-v", "constants": {}, "options": options}

@@ -1,4 +1,4 @@
-"""The table of what agents reach, of runs with known returns and times."""
+"""The table of final results, for runs with known returns and times."""
 
 import pytest
 

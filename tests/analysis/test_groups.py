@@ -1,4 +1,4 @@
-"""Runs put together: what belongs to one line of a figure, and what does not."""
+"""Groups of runs: which seeds belong to one line of a figure, and which do not."""
 
 import json
 import shutil

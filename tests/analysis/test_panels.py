@@ -1,4 +1,4 @@
-"""Figures of many runs: what is drawn, and what is said where nothing can be."""
+"""Figures of many runs: what is drawn, and the error where nothing can be drawn."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def two_tasks(tmp_path):
 
 @pytest.fixture
 def drawn(monkeypatch):
-    """The figures that are saved, as matplotlib has them."""
+    """The matplotlib figures that are saved."""
     made = []
     for module in (panels, elbo):
         monkeypatch.setattr(module, "save", lambda figure, out: made.append(figure) or out)
@@ -114,5 +114,5 @@ def test_sensitivity_compares_the_papers_settings_with_those_drawn_for_each_seed
     usual, other = panels.pooled(groups(runs), presets.drawn, presets.PAPERS)
     assert [seed for _, seed in usual.seeds] == list(range(6))
     assert sorted(seed for _, seed in other.seeds) == list(range(6))
-    with pytest.raises(UserError, match="no sensitivity study"):
+    with pytest.raises(UserError, match="not a sensitivity study"):
         panels.pooled(groups(runs[-1:]), presets.drawn, presets.PAPERS)

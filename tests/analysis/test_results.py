@@ -1,4 +1,4 @@
-"""Results that are kept in one file: what comes back from it, and that figures of it are those of the runs."""
+"""Files of results: what is read back, and that figures are the same as those of the runs themselves."""
 
 import gzip
 import json
@@ -46,7 +46,7 @@ def test_only_settings_that_are_not_the_agents_own_take_room(tmp_path):
 
 def test_a_later_default_does_not_change_what_a_file_says(tmp_path, monkeypatch):
     packed(tmp_path / "kept.json.gz", a_run(tmp_path / "run", [flat(1.0)], settings={"gamma": 0.99}))
-    (run,) = groups.find([tmp_path / "kept.json.gz"])
+    (run,) = groups.find([tmp_path / "kept.json.gz"]).runs
     (group,) = groups.groups([run], {"vrm": {**DEFAULTS["vrm"], "gamma": 0.5}})
     assert group.seeds[0][0].config["hyperparameters"]["gamma"] == 0.99
 
@@ -65,7 +65,7 @@ def test_updates_are_kept_as_the_models_loss_between_evaluations(tmp_path):
 def test_a_seed_that_diverged_and_a_run_that_goes_on_are_kept_as_they_are(tmp_path):
     a_folder(tmp_path / "diverged", [flat(1.0, 2.0), flat(1.0)], diverged=(1,))
     a_run(tmp_path / "going", [flat(1.0)], steps=100)
-    going, diverged = runs = groups.find([tmp_path / "going", tmp_path / "diverged"])
+    going, diverged = runs = groups.find([tmp_path / "going", tmp_path / "diverged"]).runs
     kept = packed(tmp_path / "kept.json.gz", *runs)
     assert [groups.is_finished(run) for run in kept] == [True, False]
     assert [row["why"] for row in kept[0].rows(1, "diverged")] == ["a loss is not finite"]
@@ -124,7 +124,7 @@ def test_a_missing_file_and_one_of_a_later_version_are_told(tmp_path):
 
 @pytest.mark.parametrize("path", KEPT, ids=lambda path: path.name)
 def test_every_file_of_results_here_can_be_drawn(path):
-    runs = groups.find([path])
+    runs = groups.find([path]).runs
     made = groups.groups([run for run in runs if groups.is_finished(run)] or runs, agents.defaults())
     assert all(group.curve().steps.size for group in made)
 

@@ -1,4 +1,4 @@
-"""The table of what trainings cost, of runs with known times and sizes."""
+"""The table of the cost of training, for runs with known times and sizes."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What `beliefrl sweep` and `beliefrl figure` make of their command lines."""
+"""The command lines of `beliefrl sweep` and `beliefrl figure`."""
 
 import pytest
 
@@ -10,7 +10,7 @@ from written import a_run, flat
 
 @pytest.fixture
 def asked(monkeypatch, tmp_path):
-    """What sweeps are asked for, which are not run."""
+    """The arguments of `sweep`, which is replaced and runs nothing."""
     given = []
 
     def sweep(experiments, folder, report, **options):

@@ -1,4 +1,4 @@
-"""How values are read from the command line and shown in its help."""
+"""How values on the command line are parsed, and shown in the help."""
 
 import dataclasses
 from typing import Annotated, Literal

@@ -1,4 +1,4 @@
-"""The report: its numbers are those of the metrics, and nothing that comes from a run can become HTML."""
+"""The report: its numbers are those of the logs, and nothing from a run can become HTML."""
 
 import json
 import os
@@ -16,8 +16,8 @@ from beliefrl.types import UserError
 from written import EVIL, HOUR, TWO_SEEDS, a_folder
 
 
-def told(folder, **options):
-    """What the page of the runs in a folder tells, read out of the page."""
+def page_data(folder, **options):
+    """The JSON in the report on the runs in a folder."""
     page = write_report([folder], folder / "page.html", **options).read_text()
     found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)
     return json.loads(found[1], parse_constant=pytest.fail)
@@ -25,7 +25,7 @@ def told(folder, **options):
 
 def test_numbers_are_those_of_the_metrics(tmp_path):
     a_folder(tmp_path / "run", TWO_SEEDS)
-    (group,) = told(tmp_path)["groups"]
+    (group,) = page_data(tmp_path)["groups"]
     assert (group["task"], group["label"], group["seeds"], group["steps"]) == ("pendulum-v", "vrm", [0, 1], 20)
     curve = group["curves"]["sampled"]
     assert curve["steps"] == [10, 20]
@@ -48,14 +48,14 @@ def test_the_interval_is_students():
 
 def test_one_seed_has_no_spread(tmp_path):
     a_folder(tmp_path / "run", TWO_SEEDS[:1])
-    final = told(tmp_path)["groups"][0]["final"]["sampled"]
+    final = page_data(tmp_path)["groups"][0]["final"]["sampled"]
     assert final == {"count": 1, "mean": 4.0, "sem": None, "interval": None}
 
 
 def test_seeds_of_several_runs_are_one_line(tmp_path):
     a_folder(tmp_path / "a", TWO_SEEDS)
     a_folder(tmp_path / "b", TWO_SEEDS[:1], first=2)
-    page = told(tmp_path)
+    page = page_data(tmp_path)
     (group,) = page["groups"]
     assert group["seeds"] == [0, 1, 2]
     assert [run["group"] for run in page["runs"]] == [0, 0]
@@ -63,7 +63,7 @@ def test_seeds_of_several_runs_are_one_line(tmp_path):
 
 def test_success_is_a_rate(tmp_path):
     a_folder(tmp_path / "run", [[(20, [1.0, 1.0], [True, False])]])
-    (group,) = told(tmp_path)["groups"]
+    (group,) = page_data(tmp_path)["groups"]
     assert group["final"]["sampled_success"]["mean"] == 0.5
     assert group["final"]["mode_success"]["mean"] == 1.0
 
@@ -72,23 +72,23 @@ def test_unfinished_runs_are_listed_and_count_when_asked(tmp_path):
     a_folder(tmp_path / "done", TWO_SEEDS)
     a_folder(tmp_path / "going", [[(10, [9.0])]], agent="slac")
     a_folder(tmp_path / "begun", [[]], agent="sac-mlp")
-    page = told(tmp_path)
+    page = page_data(tmp_path)
     assert [group["label"] for group in page["groups"]] == ["vrm"]
     of = {run["agent"]: run for run in page["runs"]}
     assert [of[agent]["finished"] for agent in ("vrm", "slac", "sac-mlp")] == [True, False, False]
     assert (of["slac"]["steps"], of["slac"]["of"], of["slac"]["group"]) == (10, 20, None)
-    with_them = told(tmp_path, unfinished=True)["groups"]
+    with_them = page_data(tmp_path, unfinished=True)["groups"]
     assert {group["label"]: group["unfinished"] for group in with_them} == {"vrm": False, "slac": True}
 
 
 def test_no_finished_run_makes_a_page_too(tmp_path):
     a_folder(tmp_path / "begun", [[]])
-    assert told(tmp_path)["groups"] == []
+    assert page_data(tmp_path)["groups"] == []
 
 
-def test_a_seed_that_diverged_is_left_out_and_told(tmp_path):
+def test_a_seed_that_diverged_is_left_out_and_page_data(tmp_path):
     a_folder(tmp_path / "run", [TWO_SEEDS[0], TWO_SEEDS[1][:1]], diverged=[1])
-    page = told(tmp_path)
+    page = page_data(tmp_path)
     (group,) = page["groups"]
     assert group["diverged"] == {"1": 15}
     assert group["curves"]["sampled"]["seeds"] == [[1.5, 4.0], [1.5, None]]
@@ -98,14 +98,14 @@ def test_a_seed_that_diverged_is_left_out_and_told(tmp_path):
 
 def test_where_every_seed_diverged_there_is_no_final_return(tmp_path):
     a_folder(tmp_path / "run", [[(10, [1.0])], [(10, [2.0])]], diverged=[0, 1])
-    (group,) = told(tmp_path)["groups"]
+    (group,) = page_data(tmp_path)["groups"]
     assert group["final"]["sampled"]["mean"] is None
     assert group["curves"]["sampled"]["mean"] == [1.5]
 
 
 def test_what_is_not_finite_is_null(tmp_path):
     a_folder(tmp_path / "run", [[(10, [float("nan")]), (20, [float("inf")])]], hyperparameters={"gamma": float("nan")})
-    (group,) = told(tmp_path)["groups"]
+    (group,) = page_data(tmp_path)["groups"]
     assert group["curves"]["sampled"]["mean"] == [None, None]
 
 
@@ -113,20 +113,23 @@ def test_time_is_the_sum_of_all_sessions(tmp_path):
     a_folder(tmp_path / "a", TWO_SEEDS, **HOUR, resumed=[HOUR])
     a_folder(tmp_path / "b", TWO_SEEDS, **HOUR, resumed=[{"started": HOUR["started"]}])
     a_folder(tmp_path / "c", TWO_SEEDS)
-    assert [run["seconds"] for run in told(tmp_path)["runs"]] == [7200.0, None, None]
+    assert [run["seconds"] for run in page_data(tmp_path)["runs"]] == [7200.0, None, None]
 
 
 def test_the_plain_agents_line_is_not_dashed(tmp_path):
     a_folder(tmp_path / "a", TWO_SEEDS, hyperparameters={"gamma": 0.9})
     a_folder(tmp_path / "b", TWO_SEEDS, hyperparameters={})
-    assert [(label["name"], label["dash"]) for label in told(tmp_path)["labels"]] == [("vrm gamma=0.9", 1), ("vrm", 0)]
+    assert [(label["name"], label["dash"]) for label in page_data(tmp_path)["labels"]] == [
+        ("vrm gamma=0.9", 1),
+        ("vrm", 0),
+    ]
 
 
 def test_settings_are_those_that_differ_from_the_agents(tmp_path):
     a_folder(tmp_path / "a", TWO_SEEDS, hyperparameters={"gamma": 0.99, "d_size": 7, "policy_layers": [256, 256]})
     a_folder(tmp_path / "b", TWO_SEEDS, agent="vrm-single", hyperparameters={"models": "single"})
     a_folder(tmp_path / "c", TWO_SEEDS, agent="mine:Agent", hyperparameters={"x": 1})
-    assert [run["settings"] for run in told(tmp_path)["runs"]] == [["d_size=7"], [], None]
+    assert [run["settings"] for run in page_data(tmp_path)["runs"]] == [["d_size=7"], [], None]
 
 
 def test_videos_and_curves_are_linked_from_where_the_page_lies(tmp_path):
@@ -146,12 +149,12 @@ def test_text_of_runs_cannot_become_html(tmp_path):
     page = write_report([tmp_path], tmp_path / "page.html").read_text()
     assert "<img" not in page
     assert page.count("</script>") == 2
-    assert told(tmp_path)["groups"][0]["task"] == EVIL
+    assert page_data(tmp_path)["groups"][0]["task"] == EVIL
 
 
 def test_a_name_may_be_empty(tmp_path):
     a_folder(tmp_path / "run", TWO_SEEDS, agent="", task="")
-    assert told(tmp_path)["labels"][0]["name"] == ""
+    assert page_data(tmp_path)["labels"][0]["name"] == ""
 
 
 def test_a_page_is_there_whole_or_not_at_all(tmp_path, monkeypatch):
@@ -164,13 +167,13 @@ def test_a_page_is_there_whole_or_not_at_all(tmp_path, monkeypatch):
     assert page.read_text() == before
 
 
-def test_runs_that_cannot_be_read_and_damaged_lines_are_told(tmp_path):
+def test_runs_that_cannot_be_read_and_damaged_lines_are_page_data(tmp_path):
     good, bad = a_folder(tmp_path / "good", TWO_SEEDS), a_folder(tmp_path / "bad", TWO_SEEDS)
     (bad / "config.json").write_bytes(b"\x00\xff")
     log = good / "metrics" / "seed-0.jsonl"
     log.write_text(f'{EVIL}\n{log.read_text()}{{"half')
     sentences = []
-    page = told(tmp_path, note=sentences.append)
+    page = page_data(tmp_path, note=sentences.append)
     assert page["damage"] == sentences
     assert "bad/config.json cannot be read" in sentences[0]
     assert "Line 1 of" in sentences[1]
@@ -179,10 +182,10 @@ def test_runs_that_cannot_be_read_and_damaged_lines_are_told(tmp_path):
     assert page["groups"][0]["curves"]["sampled"]["seeds"] == [[1.5, 4.0], [1.5, 7.0]]
 
 
-@pytest.mark.parametrize(("out", "said"), [("page.txt", "call it"), ("missing/page.html", "no folder")])
-def test_a_page_that_cannot_be_written_is_refused(tmp_path, out, said):
+@pytest.mark.parametrize(("out", "message"), [("page.txt", "must end in .html"), ("missing/page.html", "no folder")])
+def test_a_page_that_cannot_be_written_is_refused(tmp_path, out, message):
     a_folder(tmp_path / "run", TWO_SEEDS)
-    with pytest.raises(UserError, match=said):
+    with pytest.raises(UserError, match=message):
         write_report([tmp_path], tmp_path / out)
 
 

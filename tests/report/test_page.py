@@ -1,4 +1,4 @@
-"""The page of a report in headless Chromium, as a reader uses it; skipped where there is none."""
+"""The page of a report in headless Chromium, used as by a reader; skipped without Chromium."""
 
 import json
 import re
@@ -33,7 +33,7 @@ def browser_test(test):
 
 
 @pytest.fixture
-def opened(a_page):
+def browser_page(a_page):
     with Page(a_page) as page:
         yield page
         assert page.console == []
@@ -41,64 +41,64 @@ def opened(a_page):
 
 
 @browser_test
-def test_filters_hide_curves_and_rows(opened):
+def test_filters_hide_curves_and_rows(browser_page):
     tasks = ["pendulum-v", "target-reaching", EVIL]
-    assert opened.run(PANELS) == tasks
-    assert sorted(opened.run(VISIBLE_ROWS)) == sorted(["pendulum-v", *tasks])
-    opened.run("document.querySelector('[name=task][value=pendulum-v]').click()")
-    assert opened.run(PANELS) == tasks[1:]
-    assert sorted(opened.run(VISIBLE_ROWS)) == sorted(tasks[1:])
-    opened.run("document.querySelector('[name=task][value=pendulum-v]').click()")
-    opened.run("document.querySelector('[name=label][value=vrm]').click()")
-    assert opened.run(LINES) == ["slac", EVIL]
-    assert opened.run(VISIBLE_ROWS) == ["pendulum-v", EVIL]
+    assert browser_page.run(PANELS) == tasks
+    assert sorted(browser_page.run(VISIBLE_ROWS)) == sorted(["pendulum-v", *tasks])
+    browser_page.run("document.querySelector('[name=task][value=pendulum-v]').click()")
+    assert browser_page.run(PANELS) == tasks[1:]
+    assert sorted(browser_page.run(VISIBLE_ROWS)) == sorted(tasks[1:])
+    browser_page.run("document.querySelector('[name=task][value=pendulum-v]').click()")
+    browser_page.run("document.querySelector('[name=label][value=vrm]').click()")
+    assert browser_page.run(LINES) == ["slac", EVIL]
+    assert browser_page.run(VISIBLE_ROWS) == ["pendulum-v", EVIL]
 
 
 @browser_test
-def test_hover_shows_the_numbers(opened):
-    opened.hover(".panel > svg", right=0.97)
-    shown = opened.run("document.querySelector('.tip').innerText")
+def test_hover_shows_the_numbers(browser_page):
+    browser_page.hover(".panel > svg", right=0.97)
+    shown = browser_page.run("document.querySelector('.tip').innerText")
     assert "step 20" in shown
     assert re.search(r"vrm\s+5.50 ± 1.50\s+2 seeds", shown)
     assert re.search(r"slac\s+4.00\s+1 seed\b", shown)
-    opened.run("document.querySelector('[value=mode]').click()")
-    opened.hover(".panel > svg", right=0.5)
-    assert re.search(r"step 10\s+vrm\s+7.00 ± 0.00", opened.run("document.querySelector('.tip').innerText"))
+    browser_page.run("document.querySelector('[value=mode]').click()")
+    browser_page.hover(".panel > svg", right=0.5)
+    assert re.search(r"step 10\s+vrm\s+7.00 ± 0.00", browser_page.run("document.querySelector('.tip').innerText"))
 
 
 @browser_test
-def test_success_and_seeds_are_switched(opened):
-    opened.run("document.querySelector('[value=_success]').click()")
-    assert opened.run(PANELS) == ["target-reaching"]
-    assert opened.run("document.querySelectorAll('.panel:not([hidden]) .seed').length") == 2
-    opened.run("document.querySelector('[name=seeds]').click()")
-    assert opened.run("document.querySelectorAll('.panel:not([hidden]) .seed').length") == 0
-    opened.hover(".panel:not([hidden]) > svg", right=0.97)
-    assert "50 % ± 50" in opened.run("document.querySelector('.panel:not([hidden]) .tip').innerText")
+def test_success_and_seeds_are_switched(browser_page):
+    browser_page.run("document.querySelector('[value=_success]').click()")
+    assert browser_page.run(PANELS) == ["target-reaching"]
+    assert browser_page.run("document.querySelectorAll('.panel:not([hidden]) .seed').length") == 2
+    browser_page.run("document.querySelector('[name=seeds]').click()")
+    assert browser_page.run("document.querySelectorAll('.panel:not([hidden]) .seed').length") == 0
+    browser_page.hover(".panel:not([hidden]) > svg", right=0.97)
+    assert "50 % ± 50" in browser_page.run("document.querySelector('.panel:not([hidden]) .tip').innerText")
 
 
 @browser_test
-def test_headings_sort(opened):
+def test_headings_sort(browser_page):
     names = "[...document.querySelectorAll('#final tbody tr')].map((row) => row.cells[4].innerText.split(' ')[0])"
-    opened.run("document.querySelectorAll('#final thead button')[4].click()")
-    falling = opened.run(names)
+    browser_page.run("document.querySelectorAll('#final thead button')[4].click()")
+    falling = browser_page.run(names)
     assert falling[0] == "5.50"
-    opened.run("document.querySelectorAll('#final thead button')[4].click()")
-    assert list(map(float, opened.run(names))) == sorted(map(float, falling))
+    browser_page.run("document.querySelectorAll('#final thead button')[4].click()")
+    assert list(map(float, browser_page.run(names))) == sorted(map(float, falling))
 
 
 @browser_test
-def test_an_opened_run_shows_its_configuration_as_text(opened):
+def test_an_opened_run_shows_its_configuration_as_text(browser_page):
     other, run = (f"document.querySelectorAll('#settings > details')[{index}]" for index in (1, 3))
     for each in (other, run):
-        opened.run(f"{each}.querySelector('summary').click()")
-    opened.frame()
-    assert "gamma=0.5" in opened.run(f"{other}.innerText")
-    assert opened.run(f"{run}.querySelector('dl code').innerText") == f"'{EVIL}' 'a b'"
-    assert json.loads(opened.run(f"{run}.querySelector('pre').textContent"))["task"] == EVIL
-    assert opened.run(f"{run}.querySelector('.media a').getAttribute('href')") == "d/curve.png"
-    assert opened.run("document.querySelectorAll('[onerror]').length") == 0
-    opened.requests = [address for address in opened.requests if not address.endswith("/d/curve.png")]
+        browser_page.run(f"{each}.querySelector('summary').click()")
+    browser_page.frame()
+    assert "gamma=0.5" in browser_page.run(f"{other}.innerText")
+    assert browser_page.run(f"{run}.querySelector('dl code').innerText") == f"'{EVIL}' 'a b'"
+    assert json.loads(browser_page.run(f"{run}.querySelector('pre').textContent"))["task"] == EVIL
+    assert browser_page.run(f"{run}.querySelector('.media a').getAttribute('href')") == "d/curve.png"
+    assert browser_page.run("document.querySelectorAll('[onerror]').length") == 0
+    browser_page.requests = [address for address in browser_page.requests if not address.endswith("/d/curve.png")]
 
 
 @browser_test
@@ -125,7 +125,7 @@ def test_a_phone_scrolls_only_downwards(a_page):
 @browser_test
 @pytest.mark.parametrize("width", [360, 600])
 def test_a_phone_shows_every_cell_of_every_table_with_its_heading(a_page, width):
-    """A table's box could be scrolled sideways, but nothing on a phone would say so."""
+    """Phones hide scroll bars, so a reader would not notice columns beyond the edge."""
     with Page(a_page, width=width, height=740, mobile=True) as page:
         rights = page.run("[...document.querySelectorAll('.box *')].map((part) => part.getBoundingClientRect().right)")
         assert len(rights) > 50

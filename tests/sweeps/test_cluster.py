@@ -37,7 +37,7 @@ def ray_command(*arguments):
 
 @pytest.fixture
 def alone():
-    """Waits until no other test has a cluster: `ray stop` stops all that are on this machine."""
+    """Waits until no other test has a cluster: `ray stop` stops all clusters on this machine."""
     fcntl = pytest.importorskip("fcntl")
     with (pathlib.Path(tempfile.gettempdir()) / "beliefrl-tests-of-ray").open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
@@ -59,7 +59,7 @@ def head(alone):
 
 
 def begin(out, head, line):
-    """The program, as it sweeps on the cluster."""
+    """A process that runs a sweep on the cluster."""
     command = [*SWEEP, *line.split(), "--out", str(out), "--ray", head]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
@@ -81,9 +81,9 @@ LONG += SETTINGS
 def test_a_cluster_trains_what_this_machine_would(tmp_path, head):
     line = f"--agents sac-mlp --tasks pendulum-v pendulum-p --seeds 1 --steps 300 --set eval_every=100 {SETTINGS}"
     process = begin(tmp_path / "there", head, line)
-    said, _ = process.communicate(timeout=300)
-    assert process.returncode == 0, said
-    assert "2 trainings, 2 at a time" in said  # a node has one core, so both were at work
+    output, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, output
+    assert "2 trainings, 2 at a time" in output  # each node has one core, so both nodes worked
     settings = {"eval_every": 100, "eval_episodes": 1, "step_start_rl": 100, "pretrain_updates": 5}
     layers = {"policy_layers": [8], "value_layers": [8]}
     sweep(grid(["sac-mlp"], ["pendulum-v", "pendulum-p"], seeds=1, steps=300, **settings, **layers), tmp_path / "here")
@@ -96,29 +96,29 @@ def test_a_sweep_on_a_cluster_can_be_stopped_and_goes_on(tmp_path, head):
     process = begin(tmp_path, head, LONG)
     wait_until_it_learns(tmp_path, process)
     process.send_signal(signal.SIGINT)
-    said, _ = process.communicate(timeout=300)
-    assert process.returncode == 130, said
-    assert "stopped with 0 of 1 trainings finished" in said
+    output, _ = process.communicate(timeout=300)
+    assert process.returncode == 130, output
+    assert "stopped with 0 of 1 trainings finished" in output
     (folder,) = (path.parent for path in tmp_path.glob("*/config.json"))
     assert not (folder / "results.json").exists()
     assert list((folder / "checkpoints").iterdir())
     again = begin(tmp_path, head, "")
-    said, _ = again.communicate(timeout=300)
-    assert again.returncode == 0, said
-    assert "1 of 1 trainings finished" in said
+    output, _ = again.communicate(timeout=300)
+    assert again.returncode == 0, output
+    assert "1 of 1 trainings finished" in output
 
 
 def test_a_training_whose_worker_dies_goes_on_by_itself(tmp_path, head):
     process = begin(tmp_path, head, LONG)
     wait_until_it_learns(tmp_path, process)
-    out = subprocess.run(["pgrep", "-f", "ray::.*train_there"], capture_output=True, text=True).stdout
+    out = subprocess.run(["pgrep", "-f", "ray::.*train_on_node"], capture_output=True, text=True).stdout
     assert out.split()
     for worker in out.split():
         with contextlib.suppress(ProcessLookupError):
             os.kill(int(worker), signal.SIGKILL)
-    said, _ = process.communicate(timeout=300)
-    assert process.returncode == 0, said
-    assert "1 of 1 trainings finished" in said
+    output, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, output
+    assert "1 of 1 trainings finished" in output
 
 
 def test_where_there_is_no_cluster_is_told(tmp_path):

@@ -1,4 +1,4 @@
-"""Trainings in processes of their own on this machine; whole sweeps in the slow tests."""
+"""Trainings as separate processes on this machine; the slow tests run whole sweeps."""
 
 import contextlib
 import os
@@ -77,7 +77,7 @@ def test_a_training_has_one_thread_on_a_core_and_one_gpu_on_a_gpu(tmp_path, monk
 
 @pytest.mark.slow
 def test_a_sweep_is_its_trainings_and_a_failure_harms_no_other(tmp_path):
-    """The log of a seed is that of the same training alone; an environment that breaks is told at the end."""
+    """A seed's log is the same as that of the training alone; an environment that fails is reported at the end."""
     experiments = [
         *grid(["sac-mlp"], ["pendulum-v"], seeds=2, **QUICK),
         Experiment("sac-mlp", "gym:wheels:Raises-v0", QUICK, seeds=(0,)),
@@ -152,8 +152,8 @@ def test_trainings_stop_with_a_checkpoint_where_the_sweep_is_killed(tmp_path):
         time.sleep(0.2)
     process.kill()
     process.wait()
-    (said,) = (tmp_path / "sweep" / "logs").iterdir()
+    (log,) = (tmp_path / "sweep" / "logs").iterdir()
     until = time.monotonic() + 60
-    while "beliefrl resume" not in said.read_text() and time.monotonic() < until:
+    while "beliefrl resume" not in log.read_text() and time.monotonic() < until:
         time.sleep(0.2)
-    assert "stopped at step" in said.read_text()
+    assert "stopped at step" in log.read_text()

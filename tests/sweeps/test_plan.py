@@ -1,4 +1,4 @@
-"""What a sweep consists of, before anything runs."""
+"""The list of trainings in a sweep."""
 
 import dataclasses
 import json
@@ -104,19 +104,19 @@ def test_names_tell_settings_apart_and_stay_short():
         (Experiment("vrm", "pendulum", {"steps": 0}), "steps=0 is impossible"),
         (Experiment("vrm", "pendulum", {"seeds": 3}), "seeds cannot be a setting"),
         (Experiment("vrm", "pendulum", {"replay_capacity": 10}), "replay_capacity=10 is too small"),
-        (Experiment("vrm", "pendulum", observe=(7,)), "observe=(7,) does not fit"),
+        (Experiment("vrm", "pendulum", observe=(7,)), "7 is not an index of the observation"),
         (Experiment("vrm", "pendulum", constants={"wheels": 3}), "no constant 'wheels'"),
         (Experiment("vrm", "gym:No-v0"), "No-v0"),
     ],
 )
 def test_every_mistake_is_found_before_anything_begins(experiment, phrase):
-    with pytest.raises(UserError) as told:
+    with pytest.raises(UserError) as error:
         plan([Experiment("sac-mlp", "pendulum"), experiment])
-    assert phrase in str(told.value)
+    assert phrase in str(error.value)
 
 
 def test_options_of_a_training_cannot_be_varied():
-    with pytest.raises(UserError, match="only hyperparameters can be varied"):
+    with pytest.raises(UserError, match="only hyperparameters can have several values"):
         plan(grid(["vrm"], ["pendulum"], {"steps": [10, 20]}))
 
 
@@ -147,13 +147,13 @@ def test_what_is_written_down_is_read_again(tmp_path):
 @pytest.mark.parametrize(
     ("content", "phrase"),
     [
-        ("experiments = 3", "makes no list `experiments`"),
-        ("x = 3", "makes no list `experiments`"),
+        ("experiments = 3", "does not define a list `experiments`"),
+        ("x = 3", "does not define a list `experiments`"),
         ("1 / 0", "ZeroDivisionError"),
         ("def", "SyntaxError"),
     ],
 )
-def test_a_file_that_makes_no_experiments_is_told(tmp_path, content, phrase):
+def test_a_file_without_experiments_is_refused(tmp_path, content, phrase):
     (tmp_path / "mine.py").write_text(content)
     with pytest.raises(UserError, match=phrase):
         load(tmp_path / "mine.py")

@@ -1,4 +1,4 @@
-"""How far a sweep is, read off logs that are being written."""
+"""The progress of a sweep, read from logs that are being written."""
 
 import json
 
@@ -17,12 +17,12 @@ def test_the_forecast_is_what_is_left_at_the_pace_seen(tmp_path, monkeypatch):
     forecast = Forecast(tmp_path)
     forecast.watch(status)
     assert forecast.seconds_left(status) is None
-    now[0] = 30.0  # until they learn
+    now[0] = 30.0  # seconds until learning begins
     for index, training in enumerate((first, second)):
         a_run(tmp_path / training.name, [[]], first=index, updates=[(20, {"loss": 1.0})])
     forecast.watch(status)
     assert forecast.seconds_left(status) is None
-    now[0] = 70.0  # 2 s a step
+    now[0] = 70.0  # 2 s per step
     for index, training in enumerate((first, second)):
         row = {"step": 40, "kind": "update", "loss": 1.0}
         (tmp_path / training.name / "metrics" / f"seed-{index}.jsonl").write_text(json.dumps(row) + "\n")

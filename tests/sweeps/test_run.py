@@ -1,4 +1,4 @@
-"""The loop of a sweep, with trainings that end at once; the real ones are in the slow tests."""
+"""The loop of a sweep, with fake trainings that end at once; the slow tests use real ones."""
 
 import json
 import os
@@ -16,7 +16,7 @@ TWO = grid(["vrm"], ["pendulum", "cartpole"], seeds=2, steps=10)
 
 
 class Pretence:
-    """Trainings that are over when they are looked at: finished, or failed where their name says so."""
+    """Fake trainings that end at once: finished, or failed if their name says so."""
 
     fails = ""
     started = []
@@ -51,7 +51,9 @@ class Pretence:
         folder.mkdir(exist_ok=True)
         rest = {"hyperparameters": {}, "task": "", "constants": {}, "options": {"seed": 0, "seeds": 1}}
         (folder / "config.json").write_text(json.dumps({"agent": "vrm", **rest}))
-        (folder / "results.json").write_text(json.dumps({"step": training.steps}))
+        mode = {"mean": 0.0, "sem": None, "seeds": [0.0], "success": None, "seeds_success": None}
+        results = {"step": training.steps, "sampled": mode, "mode": mode}
+        (folder / "results.json").write_text(json.dumps(results))
 
     def stop(self):
         self.running = {}
@@ -89,14 +91,14 @@ def test_a_sweep_can_be_made_longer(tmp_path):
     assert Pretence.started == ["vrm-pendulum-seed0"]
 
 
-def test_a_failure_is_told_and_the_others_go_on(tmp_path, monkeypatch):
+def test_a_failure_is_reported_and_the_others_continue(tmp_path, monkeypatch):
     monkeypatch.setattr(Pretence, "fails", "pendulum-seed0")
     with pytest.raises(UserError, match=r"1 of 4 trainings failed, such as vrm-pendulum-seed0 \(it broke\)"):
         sweep(TWO, tmp_path)
     assert len(Pretence.started) == 4
     Pretence.started.clear()
     monkeypatch.setattr(Pretence, "fails", "")
-    sweep([], tmp_path)  # its plan is in its folder
+    sweep([], tmp_path)  # the trainings are read from the folder
     assert Pretence.started == ["vrm-pendulum-seed0"]
 
 
@@ -137,7 +139,7 @@ def test_a_folder_that_cannot_be_made_is_told(tmp_path):
     [
         ("step 1\nbeliefrl: It broke: mend it.\n", "It broke: mend it."),
         ("Traceback\n  line\nValueError: odd\n", "ValueError: odd"),
-        ("", "it ended with code -9 and said nothing"),
+        ("", "it ended with code -9 and printed nothing"),
     ],
 )
 def test_the_reason_of_a_failure_is_the_last_thing_that_was_said(tmp_path, log, why):

@@ -139,11 +139,11 @@ class Unhashable(Counting):
     ("make", "message"),
     [
         (lambda: gymnasium.make("BeliefRL/Pendulum-v0", weight=1.0), "pendulum has no constant 'weight'"),
-        (lambda: gymnasium.make("BeliefRL/Pendulum-v0", max_steps=9), "give gymnasium.make max_episode_steps"),
+        (lambda: gymnasium.make("BeliefRL/Pendulum-v0", max_steps=9), "use the argument max_episode_steps"),
         (lambda: TaskEnvironment("pendulm"), "did you mean pendulum"),
         (lambda: TaskEnvironment("pendulum", "ansi"), "rgb_array, human or None"),
-        (lambda: TaskEnvironment("gym:Pendulum-v1"), "gym:Pendulum-v1 is not written in JAX: use gymnasium.make"),
-        (lambda: TaskEnvironment(Counting(), ends=3), "make it with ends"),
+        (lambda: TaskEnvironment("gym:Pendulum-v1"), "gym:Pendulum-v1 is not a JAX task: use gymnasium.make"),
+        (lambda: TaskEnvironment(Counting(), ends=3), "make the task itself with ends"),
         (lambda: TaskEnvironment(Unhashable()), "Unhashable is not hashable: make it a frozen dataclass"),
         (lambda: TaskEnvironment("pendulum").step(np.zeros(1)), "call reset first"),
         (lambda: TaskEnvironment("pendulum", "rgb_array").render(), "call reset first"),
@@ -151,7 +151,7 @@ class Unhashable(Counting):
         (lambda: play(TaskEnvironment(Counting(), "human"), []), r"Counting cannot be rendered: .* draw\(states\)"),
     ],
 )
-def test_a_users_mistake_is_told(make, message):
+def test_a_users_mistake_is_one_sentence(make, message):
     with pytest.raises(UserError, match=message):
         make()
 

@@ -1,4 +1,4 @@
-"""Gymnasium environments as tasks: what the agent sees and does, what is supported, and every fault a sentence."""
+"""Gymnasium environments as tasks: observations and actions, supported spaces, and one clear message per fault."""
 
 import gymnasium
 import numpy as np
@@ -197,8 +197,8 @@ def test_a_task_is_made_again_from_its_description(name, given):
         ("gym:no_such_module:Robot-v0", {}, "no_such_module"),
         ("gym:Pendulum-v1", {"observe": [3]}, "give indices from 0 to 2"),
         ("gym:Pendulum-v1", {"observe": ["x"]}, "observe=x cannot be understood"),
-        ("gym:CartPole-v1", {"observe": "velocities"}, "does not say which"),
-        ("pendulum-v", {"observe": "velocities"}, "does not say which"),
+        ("gym:CartPole-v1", {"observe": "velocities"}, "does not define which"),
+        ("pendulum-v", {"observe": "velocities"}, "does not define which"),
         ("gym:Pendulum-v1", {"max_episode_steps": 0}, "max_episode_steps=0 is impossible"),
         ("hoper-v", {}, "did you mean hopper-v?"),
     ],

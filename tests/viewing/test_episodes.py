@@ -1,4 +1,4 @@
-"""An episode of a trained agent: every moment where it belongs, the agent's own actions, the frames asked for."""
+"""An episode of a trained agent: the recorded time steps, the agent's actions, the requested frames."""
 
 import jax
 import numpy as np

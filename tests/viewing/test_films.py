@@ -1,4 +1,4 @@
-"""Films and film strips: every frame, at its time, in a file that is there whole or not at all."""
+"""Videos and film strips: every frame at its time, and no half-written file."""
 
 import subprocess
 import sys
@@ -25,13 +25,13 @@ def run(tmp_path):
 
 @pytest.fixture
 def counted(tmp_path):
-    """A run on an environment that shows what time it is, and that environment."""
+    """A run on an environment that shows the time step in its picture, and that environment."""
     task = GymnasiumTask(Counter)
     return saved(tmp_path / "run", "sac-mlp", task), task
 
 
 def shown(path):
-    """Of each frame of a GIF: its time as `Counter` shows it, and its milliseconds."""
+    """For each frame of a GIF: the time step that `Counter` shows, and its duration in milliseconds."""
     frames = [(np.array(frame.convert("RGB"))[0, 0, 0], frame.info["duration"]) for frame in frames_of(path)]
     return [(round(int(level) / 10), duration) for level, duration in frames]
 
@@ -49,7 +49,7 @@ def test_a_film_shows_every_step_of_every_episode(tmp_path, counted):
 
 
 def test_real_time_leaves_steps_out_where_they_are_too_many_a_second(tmp_path, counted):
-    """125 steps a second are 41.7 frames a second, every third; a GIF knows hundredths of a second."""
+    """Every third of 125 steps per second is shown, 41.7 per second; a GIF counts in hundredths of a second."""
     run, task = counted
     films.video(run, tmp_path / "film.gif", task=task)
     assert shown(tmp_path / "film.gif") == [(time, 20) for time in (0, 3, 6, 9)]
@@ -57,13 +57,13 @@ def test_real_time_leaves_steps_out_where_they_are_too_many_a_second(tmp_path, c
 
 def test_an_mp4_is_as_long_as_the_episode(tmp_path, run):
     ffmpeg = pytest.importorskip("imageio_ffmpeg").get_ffmpeg_exe()
-    beliefrl.video(run, tmp_path / "film.mp4")  # a step is a twentieth of a second
+    beliefrl.video(run, tmp_path / "film.mp4")  # a step takes a twentieth of a second
     read = [ffmpeg, "-loglevel", "error", "-i", tmp_path / "film.mp4", "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     pixels = subprocess.run(read, capture_output=True, check=True).stdout
-    assert len(pixels) == 6 * 480 * 512 * 3  # square, and the line below it
-    told = subprocess.run([ffmpeg, "-i", tmp_path / "film.mp4"], capture_output=True, text=True).stderr
-    assert "20 fps" in told
-    assert "yuv420p" in told
+    assert len(pixels) == 6 * 480 * 512 * 3  # a square, and the line of text below it
+    info = subprocess.run([ffmpeg, "-i", tmp_path / "film.mp4"], capture_output=True, text=True).stderr
+    assert "20 fps" in info
+    assert "yuv420p" in info
 
 
 class Failing(Counter):

@@ -1,4 +1,4 @@
-"""Predictions: open loop against the inference model, closed loop by hand, what it may look at, and when."""
+"""Predictions: the open loop against the inference model, the closed loop against a loop by hand, and their inputs."""
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +30,7 @@ def normal(seed, *shape):
 
 
 def episode():
-    """A made-up one."""
+    """A made-up episode."""
     is_first = jnp.arange(TIME) == 0
     reward, prev_action = jnp.where(is_first, 0.0, normal(1, TIME)), normal(2, TIME, ACTION)
     prev_action = jnp.where(is_first[:, None], 0.0, prev_action)
@@ -48,14 +48,14 @@ ALL, BEFORE = jnp.arange(TIME) >= 0, jnp.arange(TIME) < START
 
 @jax.jit
 def predicted_by_hand(model, seen):
-    """The first START moments by the inference model; then, unless all are `seen`, one by one from its own draws."""
+    """START steps by the inference model; the rest, too, if all are `seen`, or else from the model's own samples."""
     x, prev_action = INPUTS
     batched = (leaf[:, None] for leaf in (x, prev_action, EPISODE.is_first, NOISE[0]))
     inferred = jax.tree.map(lambda leaf: leaf[:, 0], model.infer(model.start(1), *batched))
     decoded = jax.vmap(model.decode)(inferred.before, inferred.z)
     state, rows = jax.tree.map(lambda leaf: leaf[START - 1], inferred.state), []
     for t in range(START, TIME):
-        if model.deterministic:  # z knows no x
+        if model.deterministic:  # z does not depend on x
             moment = jnp.zeros(X), prev_action[t], jnp.array(False), jnp.zeros(Z)
             start = jax.tree.map(lambda leaf: leaf[None], state)
             z = model.infer(start, *(leaf[None, None] for leaf in moment)).z[0, 0]
@@ -118,7 +118,7 @@ def test_the_closed_loop_sees_nothing_from_its_start_on_but_actions(name, model)
 
 
 class Dice:
-    """Predicts one of many numbers, as its key has it, with σ = 2."""
+    """Predicts a random number, drawn with its key, with σ = 2."""
 
     def predict(self, state, model, steps, seen, key):
         mean = jnp.full((3, 2), jax.random.normal(key, ()))
@@ -137,7 +137,7 @@ def few(run, **changes):
 
 
 def test_a_prediction_stands_beside_the_truth_of_its_time(tmp_path, monkeypatch):
-    """A model that copies what it sees makes no error in the open loop, and in the closed one only after `start`."""
+    """A model that copies its input makes no error in the open loop, and in the closed loop only from `start` on."""
 
     def copy(self, state, model, step, seen, key):
         x = perception(step)
@@ -169,11 +169,11 @@ def test_a_short_episode_is_seen_to_its_half(tmp_path):
 @pytest.mark.parametrize(
     ("name", "changes", "sentence"),
     [
-        ("sac-mlp", {}, "is of sac-mlp, which has no model to predict with"),
-        ("sac-lstm", {}, "is of sac-lstm, which has no model"),
+        ("sac-mlp", {}, "is a run of sac-mlp, which has no model to predict with"),
+        ("sac-lstm", {}, "is a run of sac-lstm, which has no model"),
         ("vrm-keep", {"model": "first"}, "vrm-keep has no model 'first': it has keep"),
         ("slac", {"model": "keep"}, "slac has no model 'keep': it has latent"),
-        ("slac", {"start": 13}, "start=13 is impossible: the episode has 13 moments, so give 12 or less"),
+        ("slac", {"start": 13}, "start=13 is impossible: the episode has 13 time steps, so give 12 or less"),
     ],
 )
 def test_what_cannot_be_predicted_is_told_in_a_sentence(tmp_path, name, changes, sentence):

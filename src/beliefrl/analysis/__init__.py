@@ -1,1 +1,1 @@
-"""What is read off finished runs."""
+"""Figures and tables made from the logs of runs."""

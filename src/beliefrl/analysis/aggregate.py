@@ -1,9 +1,9 @@
-"""Agents over many tasks in one number and one picture, with intervals (Agarwal et al. 2021, Sections 4.1 to 4.3).
+"""Aggregate results of agents over many tasks, with confidence intervals (Agarwal et al. 2021, Sections 4.1 to 4.3).
 
-A score is the return at the end of training put on a scale on which 0 is what a random policy gets and 1 is what there
-is to get (`BOUNDS`). The interquartile mean is the mean of the middle half of all seeds' scores on all tasks; the
-performance profile is the fraction of them over τ, for every τ. Intervals are of 95 %, by a bootstrap that draws seeds
-anew within each task (stratified).
+A score is a normalised final return: 0 is the return of a random policy, 1 is the return of a good policy (`BOUNDS`).
+The interquartile mean is the mean of the middle half of the scores of all seeds on all tasks. The performance profile
+is the fraction of these scores above a threshold τ, as a function of τ. The 95 % intervals come from a stratified
+bootstrap, which resamples the seeds within each task.
 """
 
 import pathlib
@@ -19,9 +19,9 @@ from beliefrl.analysis.palette import colours
 from beliefrl.analysis.panels import add_legend, counts, legend_height, tasks_of, with_curve
 from beliefrl.types import UserError
 
-Scores = Sequence[Float[np.ndarray, " seed"]]  # for each task
+Scores = Sequence[Float[np.ndarray, " seed"]]  # one array for each task
 
-BOUNDS = {  # returns of a random policy (uniform actions, 1,000 episodes, measured) and of a good one
+BOUNDS = {  # measured return of a random policy (uniform actions, 1,000 episodes); return of a good policy
     "pendulum": (-1_214.4, -150.0),
     "cartpole": (17.4, 1_000.0),
     "target-reaching": (0.7, 140.0),
@@ -39,14 +39,14 @@ def interquartile_mean(scores: Scores) -> float:
 
 
 def profile(scores: Scores, thresholds: Float[np.ndarray, " threshold"]) -> Float[np.ndarray, " threshold"]:
-    """The fraction of all scores that is greater than each threshold."""
+    """The fraction of all scores above each threshold."""
     return np.mean(np.concatenate(scores)[:, None] > thresholds, axis=0)
 
 
 def interval(
     statistic: Callable[[Scores], Any], scores: Scores, resamples: int = RESAMPLES, seed: int = 0
 ) -> tuple[Any, Any]:
-    """The ends of the statistic's 95 % interval: percentiles over sets of seeds drawn anew within each task."""
+    """The lower and upper end of a statistic's 95 % interval, by a bootstrap within each task."""
     random = np.random.default_rng(seed)
     drawn = [statistic([random.choice(task, task.size) for task in scores]) for _ in range(resamples)]
     low, high = np.quantile(drawn, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0)
@@ -54,15 +54,18 @@ def interval(
 
 
 def scores(groups: Sequence[Group], mode: str = "sampled") -> dict[str, Scores]:
-    """The normalised final returns of each label on the tasks that all labels have; a seed that diverged has score 0.
+    """The normalised final returns of each label, for the tasks that all labels have. A diverged seed scores 0.
 
-    Tasks without an entry in BOUNDS go from 0 to the best mean return of these groups.
+    For a task without an entry in BOUNDS, a return of 0 scores 0, and the best mean return of these groups scores 1.
+
+    Raises:
+        UserError: there is no task that all labels have, or no group has an evaluation of all its seeds.
     """
     groups = with_curve(groups, mode)
     labels = list(dict.fromkeys(group.label for group in groups))
     tasks = [task for task in tasks_of(groups) if {g.label for g in groups if g.task == task} == set(labels)]
     if not tasks:
-        raise UserError("There is no task that all of these agents have: name runs of the same tasks.")
+        raise UserError("There is no task that all of these agents have: give runs on the same tasks.")
     final = {(group.task, group.label): group.curve(mode).seeds[:, -1] for group in groups}
     table: dict[str, Scores] = {}
     for label in labels:
@@ -71,13 +74,13 @@ def scores(groups: Sequence[Group], mode: str = "sampled") -> dict[str, Scores]:
 
 
 def bounds(task: str, final: dict[tuple[str, str], np.ndarray]) -> tuple[float, float]:
-    """The returns that score 0 and 1."""
+    """The returns that have the scores 0 and 1."""
     best = max((float(np.nanmean(values)) for (of, _), values in final.items() if of == task), default=1.0)
     return known_bounds(task) or (0.0, best if best > 0 else 1.0)
 
 
 def known_bounds(task: str) -> tuple[float, float] | None:
-    """The entry of a task in BOUNDS, whatever is seen of it; None where it has none."""
+    """The task's entry in BOUNDS, which also holds for its masked versions; None if there is none."""
     return next((both for name, both in BOUNDS.items() if task.startswith(name)), None)
 
 
@@ -87,7 +90,7 @@ def _normalised(returns: np.ndarray, ends: tuple[float, float]) -> np.ndarray:
 
 
 def draw_aggregate(groups: Sequence[Group], out: pathlib.Path, mode: str = "sampled") -> pathlib.Path:
-    """Interquartile means with intervals, and performance profiles; returns the path of the PNG.
+    """Draw interquartile means with intervals, and performance profiles; returns the path of the PNG.
 
     Raises:
         UserError: there is no task that all agents have, or the files cannot be written.

@@ -14,36 +14,37 @@ COLOURS = {"sampled": "#1f6f8b", "mode": "#c8553d"}
 
 
 def evaluations(run: Run, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Steps (evaluation,), and of an entry each seed's means (seed, evaluation), as far as all seeds have come.
+    """Steps (evaluation,) that all seeds have reached, and an entry's mean for each seed (seed, evaluation).
 
-    A seed that has diverged has NaN from there on.
+    A diverged seed has NaN from its divergence on, and does not shorten the curve of the others.
     """
     seeds = [{row["step"]: float(np.mean(row[name])) for row in run.rows(seed, "evaluation")} for seed in run.seeds]
-    going = [means for means, seed in zip(seeds, run.seeds, strict=True) if not any(run.rows(seed, "diverged"))]
-    steps = sorted(set.intersection(*map(set, going or seeds)))
+    healthy = [means for means, seed in zip(seeds, run.seeds, strict=True) if not any(run.rows(seed, "diverged"))]
+    steps = sorted(set.intersection(*map(set, healthy or seeds)))
     table = [[seed.get(step, np.nan) for step in steps] for seed in seeds]
     return np.array(steps), np.array(table).reshape(len(seeds), -1)
 
 
 def means_between(updates: Sequence[Row], name: str, steps: Sequence[int]) -> np.ndarray:
-    """The mean of an entry of the updates up to each of `steps`, since the one before (step,); NaN: there is none."""
-    there = [row for row in updates if name in row]
-    at, values = np.array([row["step"] for row in there]), np.array([row[name] for row in there], float)
+    """The mean of an entry over the updates since the previous one of `steps` (step,); NaN where there is no update."""
+    rows = [row for row in updates if name in row]
+    at, values = np.array([row["step"] for row in rows]), np.array([row[name] for row in rows], float)
     within = [values[(at > low) & (at <= high)] for low, high in zip([0, *steps], steps, strict=False)]
     return np.array([part.mean() if part.size else np.nan for part in within])
 
 
 def standard_error(seeds: np.ndarray) -> np.ndarray:
-    """S.E.M. over the first axis, of those that are not NaN; zeros where there is only one."""
+    """S.E.M. over the first axis, ignoring NaN; 0 where there is only one value."""
     count = np.sum(~np.isnan(seeds), axis=0)
     squares = np.nansum((seeds - np.nanmean(seeds, axis=0)) ** 2, axis=0)
     return np.where(count > 1, np.sqrt(squares / np.maximum(count - 1, 1) / np.maximum(count, 1)), 0.0)
 
 
 def draw_curve(run: Run, path: pathlib.Path | str | None = None) -> pathlib.Path:
-    """Draw a run's evaluations, with a second panel for success where its task has one; returns the picture's path.
+    """Draw a run's evaluation returns over environment steps; returns the path of the picture.
 
-    `path` is the run's curve.png if not given. One thin line a seed, a thick one and a band for mean and S.E.M.
+    A task with a success flag gets a second panel with the success rate. Each seed is a thin line, the mean a thick
+    line, and the S.E.M. a band. Without `path` the picture is curve.png in the run's folder.
 
     Raises:
         UserError: there is no evaluation yet.
@@ -60,7 +61,7 @@ def curve_figure(run: Run) -> Any:
         UserError: there is no evaluation yet.
     """
     if not evaluations(run, "sampled")[0].size:
-        raise UserError(f"{run.folder} has no evaluation of every seed yet: there is no curve to draw.")
+        raise UserError(f"{run.folder} has no evaluation of every seed yet, so there is no curve to draw.")
     panels = [("return", "")]
     if any("sampled_success" in row for row in run.rows(run.seeds[0], "evaluation")):
         panels.append(("success rate", "_success"))

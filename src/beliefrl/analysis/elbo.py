@@ -1,4 +1,4 @@
-"""Return beside the negative ELBO of the keep-learning model, on two axes (Section 5.4)."""
+"""Figure of the return and the negative ELBO of the keep-learning model, on two axes (Section 5.4)."""
 
 import pathlib
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ GREY = "#444444"
 
 
 def model_loss(group: Group) -> Curve | None:
-    """The model's loss, a mean over the updates since the evaluation before; None if there is no model that learns."""
+    """The model's loss, averaged over the updates between evaluations; None if no model keeps learning."""
     steps = group.curve().steps
     table = []
     for run, seed in group.seeds:
@@ -26,11 +26,11 @@ def model_loss(group: Group) -> Curve | None:
         if not found:
             return None
         table.append(means_between(rows, found[0], steps.tolist()))
-    return Curve(steps, np.array(table)).since(~np.all(np.isnan(table), axis=0))
+    return Curve(steps, np.array(table)).only(~np.all(np.isnan(table), axis=0))
 
 
 def draw_elbo(groups: Sequence[Group], out: pathlib.Path, mode: str = "sampled") -> pathlib.Path:
-    """Draw both, mean and S.E.M. over seeds, a panel an agent and task; returns the path of the PNG.
+    """Draw return and model loss, mean and S.E.M. over seeds, a panel per agent and task; returns the path of the PNG.
 
     Raises:
         UserError: no run has a model that keeps learning, or the files cannot be written.

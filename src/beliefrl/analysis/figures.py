@@ -1,4 +1,4 @@
-"""Figures as files: a PNG to look at and a PDF to print, both there whole or not at all."""
+"""Figures as files: a PNG for the screen and a PDF for print. No file is left half written."""
 
 import io
 import pathlib
@@ -11,7 +11,7 @@ KINDS = (".png", ".pdf")
 
 
 def figure(width: float, height: float, layout: Any = "constrained") -> Any:
-    """A figure of matplotlib, in inches, that needs no display and leaves no global state."""
+    """A matplotlib figure, sizes in inches. It needs no display and does not touch pyplot's global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -21,30 +21,34 @@ def figure(width: float, height: float, layout: Any = "constrained") -> Any:
 
 
 def paths(path: pathlib.Path) -> tuple[pathlib.Path, pathlib.Path]:
-    """Where a figure's PNG and PDF will be; `path` may end as either, or be without an ending.
+    """The paths of a figure's PNG and PDF; `path` ends in .png or .pdf, or has no suffix.
+
+    Call it before the computation, so that a mistake is reported at once.
 
     Raises:
-        UserError: it ends otherwise, or its folder does not exist; told before anything is computed.
+        UserError: `path` has another suffix, or its folder does not exist.
     """
     if path.suffix.lower() not in ("", *KINDS):
-        raise UserError(f"{path} is impossible: a figure is written as .png and .pdf, so end its name as one of them.")
+        raise UserError(
+            f"{path} is impossible: a figure is written as .png and .pdf, so its name must end in one of them."
+        )
     check_folder(path)
     return path.with_suffix(KINDS[0]), path.with_suffix(KINDS[1])
 
 
 def check_folder(path: pathlib.Path) -> None:
-    """Raise a UserError where a file cannot be there, as there is no such folder or one of the file's own name."""
+    """Raise a UserError if the folder of `path` does not exist, or if `path` itself is a folder."""
     if not path.parent.is_dir():
-        raise UserError(f"{path} cannot be written (there is no folder {path.parent}): make it, or choose another.")
+        raise UserError(f"{path} cannot be written (there is no folder {path.parent}): create it, or choose another.")
     if path.is_dir():
         raise UserError(f"{path} cannot be written (it is a folder): choose another name.")
 
 
 def save(figure: Any, path: pathlib.Path) -> pathlib.Path:
-    """Write a figure under both of its `paths`; returns the PNG's.
+    """Write a figure to both of its `paths`; returns the path of the PNG.
 
     Raises:
-        UserError: they cannot be written.
+        UserError: the files cannot be written.
     """
     for name in paths(path):
         content = io.BytesIO()

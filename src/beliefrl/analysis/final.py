@@ -1,4 +1,4 @@
-"""The table of what agents reach: final returns with their spread, when a task was solved, and how long that took."""
+"""Table of final results: returns with their S.E.M., the step at which a task was solved, and the wall-clock time."""
 
 import pathlib
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from beliefrl.analysis.panels import counts
 from beliefrl.analysis.scalability import hours, wall_clock
 from beliefrl.analysis.tables import Column, write_table
 
-SOLVED = 0.95  # score, as in `aggregate`: over -203 on the pendulum, 951 on CartPole, 133 in target reaching
+SOLVED = 0.95  # a score of `aggregate`: a return of -203 on the pendulum, 951 on CartPole, 133 in target reaching
 
 COLUMNS = (
     Column("task"),
@@ -27,11 +27,11 @@ COLUMNS = (
 
 
 def rows(groups: Sequence[Group]) -> list[tuple[str, ...]]:
-    """A row for each agent on each task: returns at the last evaluation, mean ± S.E.M. over seeds.
+    """One row per agent and task: returns at the last evaluation, mean ± S.E.M. over seeds.
 
-    It is solved at the first evaluation at which the mean over seeds, with sampled or with mode actions, scores 0.95.
+    A task is solved at the first evaluation whose mean over seeds has a score of 0.95, with sampled or mode actions.
     """
-    made = []
+    table = []
     for group in groups:
         sampled, mode = group.curve("sampled"), group.curve("mode")
         if not sampled.steps.size:
@@ -40,7 +40,7 @@ def rows(groups: Sequence[Group]) -> list[tuple[str, ...]]:
         known = [span for span in spans if span is not None]
         seconds = sum(known) / sum(len(run.seeds) for run in group.runs) if len(known) == len(spans) else None
         success = ("sampled_success", "mode_success") if group.has_success else ("", "")
-        made.append(
+        table.append(
             (
                 f"`{group.task}`",
                 f"`{group.label}`",
@@ -52,7 +52,7 @@ def rows(groups: Sequence[Group]) -> list[tuple[str, ...]]:
                 "unknown" if seconds is None else hours(seconds),
             )
         )
-    return made
+    return table
 
 
 def _final(curve: Curve) -> str:
@@ -65,7 +65,7 @@ def _rate(group: Group, name: str) -> str:
 
 
 def _solved(task: str, *curves: Curve) -> str:
-    """The step at which the mean of one of these is good enough for the first time; - where nobody knows what is."""
+    """The first step at which the mean of one of the curves is high enough; "-" for a task without known bounds."""
     known = known_bounds(task)
     if known is None:
         return "-"

@@ -1,4 +1,4 @@
-"""Many runs put together: all seeds of one agent with the same settings on one task are one line of a figure."""
+"""Groups of runs: all seeds of one agent with the same settings on one task are one line of a figure."""
 
 import os
 import pathlib
@@ -12,30 +12,30 @@ from beliefrl.analysis import results
 from beliefrl.runs.run import Row, Run
 from beliefrl.types import UserError
 
-Seed = tuple[Run, int]  # a run and the number of one of its seeds
+RunSeed = tuple[Run, int]  # a run and one of its seed numbers
 
 
 class Curve(NamedTuple):
-    """Means over the episodes of each evaluation; NaN where a seed has diverged."""
+    """Means over the episodes of each evaluation; NaN after a seed has diverged."""
 
     steps: np.ndarray  # (evaluation,)
     seeds: np.ndarray  # (seed, evaluation)
 
-    def since(self, chosen: np.ndarray) -> "Curve":
-        """Only the evaluations where `chosen` (evaluation,)."""
+    def only(self, chosen: np.ndarray) -> "Curve":
+        """The evaluations for which `chosen` (evaluation,) is true."""
         return Curve(self.steps[chosen], self.seeds[:, chosen])
 
 
 class Group:
-    """All seeds of one agent with one set of settings on one task, out of any number of runs."""
+    """All seeds of one agent with the same settings on one task, from any number of runs."""
 
-    def __init__(self, task: str, label: str, seeds: Sequence[Seed]):
-        """`label` is the agent's name, and those settings in which it differs from others beside it."""
+    def __init__(self, task: str, label: str, seeds: Sequence[RunSeed]):
+        """`label` is the agent's name, followed by the settings in which this group differs from the others."""
         self.task, self.label, self.seeds = task, label, tuple(seeds)
 
     @property
     def runs(self) -> list[Run]:
-        """The runs that its seeds are of, each once."""
+        """The runs that contain the seeds, each once."""
         return list({run.folder: run for run, _ in self.seeds}.values())
 
     @property
@@ -48,10 +48,10 @@ class Group:
         return [list(run.rows(seed, "evaluation")) for run, seed in self.seeds]
 
     def curve(self, name: str = "sampled") -> Curve:
-        """An entry of the evaluations (sampled, mode, sampled_success, mode_success), as far as all seeds have come."""
+        """An entry of the evaluations (sampled, mode, sampled_success, mode_success), at steps that all seeds have."""
         table = [{row["step"]: float(np.mean(row[name])) for row in rows if name in row} for rows in self.evaluations]
-        going = [means for means, (run, seed) in zip(table, self.seeds, strict=True) if not _diverged(run, seed)]
-        steps = sorted(set.intersection(*map(set, going or table)))
+        healthy = [means for means, (run, seed) in zip(table, self.seeds, strict=True) if not _diverged(run, seed)]
+        steps = sorted(set.intersection(*map(set, healthy or table)))
         return Curve(np.array(steps), np.array([[seed.get(step, np.nan) for step in steps] for seed in table]))
 
     @property
@@ -59,20 +59,20 @@ class Group:
         return any("sampled_success" in row for rows in self.evaluations for row in rows)
 
 
-class Found(NamedTuple):
-    """The runs in some folders, and what is wrong with others there."""
+class FoundRuns(NamedTuple):
+    """The runs in some folders, and the damage that was found there."""
 
     runs: list[Run]
-    damage: list[str]  # a sentence for each run that cannot be read, and for each log with damaged lines
+    damage: list[str]  # one sentence for each unreadable run, and for each log with damaged lines
 
 
-def find(paths: Sequence[str | os.PathLike[str]], opened: Callable[[pathlib.Path], Run] = Run) -> Found:
-    """The runs in these folders, which are runs or hold runs at any depth, and in these files of results.
+def find(paths: Sequence[str | os.PathLike[str]], read: Callable[[pathlib.Path], Run] = Run) -> FoundRuns:
+    """The runs at these paths: a path is a run, a folder with runs at any depth, or a file of results.
 
-    A run that cannot be read is left out. `opened` opens a run's folder.
+    A run that cannot be read is left out. `read` makes a run from its folder.
 
     Raises:
-        UserError: a folder or file does not exist, holds no run, or none of the runs can be read.
+        UserError: a path does not exist or contains no run, or none of the runs can be read.
     """
     found: dict[pathlib.Path, Run] = {}
     unreadable: dict[pathlib.Path, str] = {}
@@ -81,24 +81,24 @@ def find(paths: Sequence[str | os.PathLike[str]], opened: Callable[[pathlib.Path
         if path.name.endswith(results.ENDING):
             found |= {run.folder: run for run in results.read(path)}
             continue
-        if not os.path.isdir(path):  # noqa: PTH112 - pathlib's raises where a name is too long
-            raise UserError(f"There is no folder {path}: give the --out of a training or of a sweep.")
+        if not os.path.isdir(path):  # noqa: PTH112 - pathlib's version raises if a name is too long
+            raise UserError(f"There is no folder {path}: give the folder of a run or of a sweep.")
         inside = sorted(config.parent for config in path.rglob("config.json") if (config.parent / "metrics").is_dir())
         if not (inside or (path / "config.json").exists()):
-            raise UserError(f"There is no run in {path}: give the --out of a training or of a sweep.")
+            raise UserError(f"There is no run in {path}: give the folder of a run or of a sweep.")
         for folder in inside or [path]:
             known = folder.resolve()
             if known in found or known in unreadable:
                 continue
             try:
-                run = opened(folder)
+                run = read(folder)
                 logs += run.damage()
                 found[known] = run
             except UserError as error:
                 unreadable[known] = str(error)
     if unreadable and not found:
         raise UserError(next(iter(unreadable.values())))
-    return Found(list(found.values()), [*unreadable.values(), *logs])
+    return FoundRuns(list(found.values()), [*unreadable.values(), *logs])
 
 
 def is_finished(run: Run) -> bool:
@@ -107,7 +107,7 @@ def is_finished(run: Run) -> bool:
 
 
 def last_step(run: Run, seed: int) -> int:
-    """Environment steps of a seed at its last evaluation; 0 before there was one."""
+    """Environment steps of a seed at its last evaluation; 0 if there is none."""
     return max((row["step"] for row in run.rows(seed, "evaluation")), default=0)
 
 
@@ -116,13 +116,13 @@ def _diverged(run: Run, seed: int) -> bool:
 
 
 def groups(runs: Sequence[Run], defaults: Mapping[str, Row] | None = None) -> list[Group]:
-    """The runs' seeds put together, in the order in which tasks and agents first come.
+    """The runs' seeds, grouped; tasks and agents keep the order in which they first occur.
 
-    `defaults` are the settings of agents by name (`agents.defaults`): a run that lacks some, as it is older than they
-    are, has those; and what is as usual is not in a label.
+    `defaults` are the default settings of each agent by name (`agents.defaults`). They fill in settings that a run
+    lacks because it is older than they are. A setting with its default value is not shown in a label.
 
-    Of a seed that was run twice with the same settings only the run that went furthest counts, and of those the latest:
-    a seed's number decides everything, so it would count as two what is one.
+    If a seed was trained several times with the same settings, only the run with the most steps counts, and among equal
+    ones the latest: equal seed numbers give equal trainings, which must not count as several samples.
     """
     usual = {run.config["agent"]: (defaults or {}).get(run.config["agent"], {}) for run in runs}
     settings = {run.folder: usual[run.config["agent"]] | run.config["hyperparameters"] for run in runs}
@@ -139,8 +139,8 @@ def groups(runs: Sequence[Run], defaults: Mapping[str, Row] | None = None) -> li
             if seed not in of or _precedence(run, seed) > _precedence(of[seed], seed):
                 of[seed] = run
     tasks, labels = ([*dict.fromkeys(names)] for names in zip(*seeds, strict=True)) if seeds else ([], [])
-    made = [Group(*names, [(of[seed], seed) for seed in sorted(of)]) for names, of in seeds.items()]
-    return sorted(made, key=lambda group: (tasks.index(group.task), labels.index(group.label)))
+    merged = [Group(*names, [(of[seed], seed) for seed in sorted(of)]) for names, of in seeds.items()]
+    return sorted(merged, key=lambda group: (tasks.index(group.task), labels.index(group.label)))
 
 
 def _precedence(run: Run, seed: int) -> tuple[int, str]:
@@ -148,15 +148,15 @@ def _precedence(run: Run, seed: int) -> tuple[int, str]:
 
 
 def task_of(run: Run) -> str:
-    """A task as figures name it: with what is seen of it, where its name does not say so."""
+    """The name of a task in figures: with the observed entries, if the task's own name does not say them."""
     seen = run.config.get("observe")
     return run.config["task"] + (f" observe {' '.join(map(str, seen))}" if seen else "")
 
 
-def _differences(settings: Row, beside: Sequence[Row], usual: Row | None = None) -> list[str]:
-    """NAME=VALUE of what is not the same everywhere, nor as usual."""
+def _differences(settings: Row, others: Sequence[Row], usual: Row | None = None) -> list[str]:
+    """NAME=VALUE of the settings that differ from some of `others` and from `usual`."""
     return [
         f"{name}={value}"
         for name, value in settings.items()
-        if any(other.get(name) != value for other in beside) and (not usual or usual.get(name) != value)
+        if any(other.get(name) != value for other in others) and (not usual or usual.get(name) != value)
     ]

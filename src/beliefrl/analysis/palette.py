@@ -1,8 +1,7 @@
-"""One colour for each line of a figure: an agent has the same one in every picture and on every page.
+"""Colours and dashes of the lines of a figure. An agent has the same colour in every figure and report.
 
-Lines of one agent with different settings differ in their dashes too.
-
-The colours of the agents differ for colour-blind readers too (by Machado et al. 2009), and stand out 3 to 1 from white.
+Lines of one agent with different settings have different dashes, too. Colour-blind readers can distinguish the agents'
+colours (simulated after Machado et al. 2009). Their contrast to white is at least 3 to 1.
 """
 
 from collections.abc import Sequence
@@ -21,15 +20,15 @@ OTHERS = ("#777777", "#8f8f1f", "#3c8fc0", "#b37700", "#5e4fa2", "#0f8b8d")
 
 
 def _plain_first(labels: Sequence[str]) -> list[str]:
-    """Each label once, an agent's plain name before those with settings."""
+    """The labels without duplicates; names without settings come first."""
     return sorted(dict.fromkeys(labels), key=lambda label: " " in label)
 
 
 def colours(labels: Sequence[str]) -> dict[str, str]:
     """A colour "#rrggbb" for each label, whose first word is the agent's name.
 
-    A known agent has its own; further labels of it and other agents have the next of the others, in the order of the
-    labels (plain names first) and from the start again when they are used up.
+    The first label of a known agent has the agent's colour. All others take the colours of OTHERS in turn, in the order
+    of the labels, names without settings first.
     """
     chosen: dict[str, str] = {}
     others = 0
@@ -42,7 +41,7 @@ def colours(labels: Sequence[str]) -> dict[str, str]:
 
 
 def dashes(labels: Sequence[str]) -> dict[str, int]:
-    """How many lines of its agent come before each label, the agent's plain name first: the number of its dashes."""
+    """The index of each label's dash pattern: its position among the labels of its agent, the plain name first."""
     before: dict[str, int] = {}
     chosen = {}
     for label in _plain_first(labels):

@@ -1,4 +1,4 @@
-"""Learning curves of many agents on many tasks: a panel a task, a line an agent (Section 5, Appendices C, F)."""
+"""Learning curves of many agents on many tasks: one panel per task, one line per agent (Section 5, Appendices C, F)."""
 
 import pathlib
 import textwrap
@@ -15,17 +15,17 @@ from beliefrl.types import UserError
 
 COLUMNS = 3
 PANEL = (3.5, 2.7)  # inches
-HANDLE, LETTER = 0.6, 0.072  # inches of a legend's entry beside its label, and of a letter there
-DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (7, 2, 1.5, 2)), (0, (3, 1, 1, 1, 1, 1)))  # in widths of the line
+HANDLE, LETTER = 0.6, 0.072  # inches: of a legend entry without its label, of a letter
+DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (7, 2, 1.5, 2)), (0, (3, 1, 1, 1, 1, 1)))  # lengths in line widths
 
 
 def draw_curves(groups: Sequence[Group], out: pathlib.Path, mode: str = "sampled") -> pathlib.Path:
-    """Return over environment steps, mean and S.E.M. over seeds; a second panel for success where a task has it.
+    """Draw returns over environment steps, mean and S.E.M. over seeds. Tasks with success get a panel for its rate.
 
     Args:
-        groups: lines, of which those of one task share a panel.
-        out: the picture is written as .png and .pdf.
-        mode: of the actions, sampled (as in the paper) or mode.
+        groups: the lines; groups of the same task share a panel.
+        out: path of the figure, which is written as .png and .pdf.
+        mode: which actions, "sampled" (as in the paper) or "mode".
 
     Returns:
         The path of the PNG.
@@ -51,14 +51,14 @@ def draw_curves(groups: Sequence[Group], out: pathlib.Path, mode: str = "sampled
 
 
 def with_curve(groups: Sequence[Group], mode: str) -> list[Group]:
-    """Those that have something to draw.
+    """The groups that have an evaluation of all their seeds.
 
     Raises:
-        UserError: there is none.
+        UserError: there is no such group.
     """
     chosen = [group for group in groups if group.curve(mode).steps.size]
     if not chosen:
-        raise UserError("No run has an evaluation of all its seeds yet: there is no curve to draw.")
+        raise UserError("No run has an evaluation of all its seeds yet, so there is no curve to draw.")
     return chosen
 
 
@@ -67,7 +67,7 @@ def tasks_of(groups: Sequence[Group]) -> list[str]:
 
 
 def panels(count: int, labels: Sequence[str]) -> tuple[Any, list[Any]]:
-    """A figure with so many panels, and with room for a legend of these labels below them."""
+    """A figure with `count` panels, and space for a legend of these labels below them."""
     columns = min(COLUMNS, count)
     rows = -(-count // columns)
     width = max(columns * PANEL[0], 4.5)
@@ -79,14 +79,14 @@ def panels(count: int, labels: Sequence[str]) -> tuple[Any, list[Any]]:
 
 
 def draw_line(axis: Any, curve: Curve, colour: str, label: str, **style: Any) -> None:
-    """Mean and S.E.M. over seeds."""
+    """Draw the mean of a curve over its seeds, and its S.E.M. as a band."""
     mean, error = np.nanmean(curve.seeds, axis=0), standard_error(curve.seeds)
     axis.plot(curve.steps, mean, color=colour, linewidth=1.6, label=label, **style)
     axis.fill_between(curve.steps, mean - error, mean + error, color=colour, alpha=0.2, linewidth=0)
 
 
 def finish(axis: Any, title: str, ordinate: str) -> None:
-    """Title, labels, grid."""
+    """Add the title, the labels and the grid."""
     axis.set_title(title, fontsize=10)
     axis.set_xlabel("environment steps", fontsize=9)
     axis.set_ylabel(ordinate, fontsize=9)
@@ -98,7 +98,7 @@ def finish(axis: Any, title: str, ordinate: str) -> None:
 
 
 def thousands(value: float, _: Any = None) -> str:
-    """20000 as 20k."""
+    """A tick label: 20000 as "20k"."""
     return f"{value / 1000:g}k" if value else "0"
 
 
@@ -109,23 +109,23 @@ def _locator() -> Any:
 
 
 def legend_columns(labels: Sequence[str], width: float) -> int:
-    """How many labels stand side by side in a figure so many inches wide."""
+    """The number of legend columns in a figure of this width (inches)."""
     return max(1, int(width / max(2.1, HANDLE + LETTER * max(map(len, labels)))))
 
 
 def wrapped(labels: Sequence[str], width: float) -> list[str]:
-    """Labels of as many lines as they need to be no wider than the figure."""
+    """The labels, broken into lines that fit the width of the figure (inches)."""
     return [textwrap.fill(label, int((width - HANDLE) / LETTER)) for label in labels]
 
 
 def legend_height(labels: Sequence[str], width: float) -> float:
-    """Inches that labels take in a figure so many inches wide."""
+    """The height of the legend in inches, in a figure of this width (inches)."""
     lines = sum(label.count("\n") + 1 for label in wrapped(labels, width))
     return 0.25 * -(-lines // legend_columns(labels, width))
 
 
 def add_legend(made: Any, colour: dict[str, str], title: str, style: dict[str, Any] | None = None) -> None:
-    """One legend below all panels; lines are solid but for those with a style."""
+    """Add one legend below all panels. Lines are solid unless `style` has another line style for their label."""
     from matplotlib.lines import Line2D
 
     dash, width = style or {}, made.get_figwidth()
@@ -146,27 +146,27 @@ def add_legend(made: Any, colour: dict[str, str], title: str, style: dict[str, A
 
 
 def spread(groups: Sequence[Group]) -> str:
-    """What lines are the mean of."""
+    """The legend's title: how many seeds the lines are a mean of."""
     seeds = {len(group.seeds) for group in groups}
     return "1 seed each" if seeds == {1} else f"mean and S.E.M. of {counts(seeds)} seeds"
 
 
 def counts(numbers: Collection[int]) -> str:
-    """3, or 2 to 5."""
+    """The range of the numbers as text: "3", or "2 to 5"."""
     low, high = min(numbers), max(numbers)
     return str(low) if low == high else f"{low} to {high}"
 
 
 def pooled(groups: Sequence[Group], drawn: Callable[[int], dict[str, Any]], papers: dict[str, Any]) -> list[Group]:
-    """VRM with the paper's settings, and with settings drawn anew for every seed: two groups a task (Appendix F).
+    """Two groups per task: VRM with the paper's settings, and with settings drawn for each seed (Appendix F).
 
     Args:
         groups: runs of VRM.
-        drawn: the settings of a seed.
+        drawn: gives the drawn settings of a seed.
         papers: the paper's settings.
 
     Raises:
-        UserError: a task has no run with the paper's settings, or none with those of its seed.
+        UserError: no task has both a run with the paper's settings and a run with drawn settings.
     """
 
     def has(run: Any, settings: dict[str, Any]) -> bool:
@@ -180,5 +180,5 @@ def pooled(groups: Sequence[Group], drawn: Callable[[int], dict[str, Any]], pape
         if usual and other:
             made += [Group(task, "vrm, the paper's settings", usual), Group(task, "vrm, drawn settings", other)]
     if not made:
-        raise UserError("These runs are no sensitivity study: `beliefrl sweep --preset sensitivity` makes one.")
+        raise UserError("These runs are not a sensitivity study: `beliefrl sweep --preset sensitivity` makes one.")
     return made

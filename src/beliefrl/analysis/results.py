@@ -1,10 +1,10 @@
-"""Results that are kept: the runs of an experiment in one small file, NAME.json.gz, which figures read as runs.
+"""Files of results: the runs of an experiment in one small file, NAME.json.gz. Figures read it like folders of runs.
 
     {"format": 1, "defaults": {AGENT: {NAME: value}}, "runs": [{"name", "config", "rows": {SEED: [row]}}]}
 
-`config` is the run's config.json, with only those hyperparameters that differ from the file's defaults of the agent.
-The rows are the evaluations, the divergences, and the means of the updates' `SERIES` between evaluations. Numbers have
-six significant digits.
+`config` is the run's config.json, but only with the hyperparameters that differ from the agent's `defaults` in the
+file. The rows are the evaluations, the divergences, and the means of `SERIES` over the updates between evaluations.
+Numbers have six significant digits.
 """
 
 import gzip
@@ -25,16 +25,16 @@ from beliefrl.types import UserError
 ENDING = ".json.gz"
 FORMAT = 1
 DIGITS = 6  # significant
-KINDS = ("evaluation", "diverged")  # rows that are kept whole
-MODEL_LOSSES = ("negative_elbo", "prediction_error")  # what an agent's model learns to make small, as its log calls it
+KINDS = ("evaluation", "diverged")  # rows that are stored unchanged
+MODEL_LOSSES = ("negative_elbo", "prediction_error")  # names of a model's loss in the logs
 SERIES = (*MODEL_LOSSES, "q")
 
 
 class KeptRun(Run):
-    """A run out of a file of results: its settings, evaluations and means of its updates, but no trained agent."""
+    """A run from a file of results: it has settings, evaluations and means of the updates, but no trained agent."""
 
     def __init__(self, folder: pathlib.Path, config: dict[str, Any], rows: Mapping[int, Sequence[Row]]):
-        """`folder` names the run: the file, and the name of the folder that it was packed from."""
+        """`folder` identifies the run: the path of the file, and the name of the run's original folder."""
         self.folder, self.config, self._rows = folder, config, rows
 
     def rows(self, seed: int, kind: str | None = None) -> Iterator[Row]:
@@ -42,7 +42,7 @@ class KeptRun(Run):
 
 
 def cut(run: Run, until: int) -> KeptRun:
-    """The run as it was after so many environment steps."""
+    """The run with only the rows up to `until` environment steps."""
     rows = {seed: [row for row in run.rows(seed) if row["step"] <= until] for seed in run.seeds}
     return KeptRun(run.folder, run.config, rows)
 
@@ -51,7 +51,7 @@ def read(path: pathlib.Path) -> list[KeptRun]:
     """The runs in a file of results, with all their hyperparameters.
 
     Raises:
-        UserError: there is no such file, or it is not what `write` writes.
+        UserError: there is no such file, or it is not a file of results.
     """
     try:
         content = json.loads(gzip.decompress(path.read_bytes()))
@@ -74,15 +74,15 @@ def _unpacked(path: pathlib.Path, entry: dict[str, Any], defaults: Mapping[str, 
 
 
 def write(path: pathlib.Path, runs: Sequence[Run], defaults: Mapping[str, Row]) -> None:
-    """Write runs, finished or not, as one file; the same runs give the same bytes.
+    """Write runs, finished or not, to one file. The same runs give the same bytes.
 
     Args:
-        path: the file, NAME.json.gz. One that is there is replaced: to add to it, give the runs that are in it too.
-        runs: runs from folders or from files of results. Of a training that is there twice the later one counts.
+        path: the file, NAME.json.gz. An existing file is replaced: to extend it, give its runs as well.
+        runs: runs from folders or from files of results. If a training occurs twice, the later one is written.
         defaults: the hyperparameters of agents by name (`agents.defaults`).
 
     Raises:
-        UserError: two trainings have folders of one name, or the file cannot be written.
+        UserError: two different trainings have folders of the same name, or the file cannot be written.
     """
     entries: dict[str, dict[str, Any]] = {}
     for run in runs:
@@ -107,7 +107,7 @@ def _packed(run: Run, usual: Row) -> dict[str, Any]:
     settings = usual | run.config["hyperparameters"]
     own = {name: value for name, value in settings.items() if usual.get(name, missing) != value}
     text = json.dumps(run.config | {"hyperparameters": own})
-    config = json.loads(re.sub(r'"/[^"]*/(runs/[^"]*)"', r'"\1"', text))  # where it lay on this machine says nothing
+    config = json.loads(re.sub(r'"/[^"]*/(runs/[^"]*)"', r'"\1"', text))  # cut absolute paths to runs/...
     return {"name": run.folder.name, "config": config, "rows": {seed: _kept_rows(run, seed) for seed in run.seeds}}
 
 

@@ -1,4 +1,4 @@
-"""What trainings cost: wall-clock time and parameters of each agent, as Markdown and as LaTeX (Appendix G)."""
+"""Table of the cost of training: wall-clock time and parameters of each agent (Appendix G)."""
 
 import math
 import pathlib
@@ -13,19 +13,19 @@ from beliefrl.analysis.tables import Column, write_table
 from beliefrl.runs import arrays
 from beliefrl.runs.run import Run
 
-STEPS = 100_000  # of the paper's table
+STEPS = 100_000  # as in the paper's table
 
 
 class Cost(NamedTuple):
     label: str
     task: str
-    seconds: float | None  # for STEPS environment steps of one seed, pre-training and compilation in it; None: unknown
-    parameters: int | None  # numbers in the networks of one seed; None: no agent was saved
-    steps: int  # that were timed
+    seconds: float | None  # STEPS environment steps of one seed, with pre-training and compilation; None: unknown
+    parameters: int | None  # of the networks of one seed; None: no agent was saved
+    steps: int  # environment steps that were timed
 
 
 def wall_clock(run: Run) -> float | None:
-    """Seconds that a run's sessions took together; None where one was killed, so that nobody knows its end."""
+    """Total seconds of a run's sessions; None if a session was killed, so that its end is unknown."""
     total = 0.0
     for session in (run.config, *run.config.get("resumed", ())):
         try:
@@ -37,7 +37,7 @@ def wall_clock(run: Run) -> float | None:
 
 
 def parameters(run: Run) -> int | None:
-    """How many numbers the saved agent of one seed holds (`Agent.networks`)."""
+    """The number of parameters in the saved networks of one seed (`Agent.networks`); None if no agent was saved."""
     path = run.folder / "agent.safetensors"
     if not path.exists():
         return None
@@ -45,16 +45,16 @@ def parameters(run: Run) -> int | None:
 
 
 def costs(groups: Sequence[Group]) -> list[Cost]:
-    """What each agent cost, the median over its runs."""
-    made = []
+    """The cost of each group; the time is the median over its runs."""
+    table = []
     for group in groups:
         spans = [(wall_clock(run), max(last_step(run, seed) for seed in run.seeds), run) for run in group.runs]
         timed = [span / steps / len(run.seeds) for span, steps, run in spans if span is not None and steps]
         sizes = [size for run in group.runs if (size := parameters(run)) is not None]
         seconds = float(np.median(timed)) * STEPS if timed else None
         steps = max((steps for _, steps, _ in spans), default=0)
-        made.append(Cost(group.label, group.task, seconds, sizes[0] if sizes else None, steps))
-    return made
+        table.append(Cost(group.label, group.task, seconds, sizes[0] if sizes else None, steps))
+    return table
 
 
 COLUMNS = (
@@ -67,14 +67,14 @@ COLUMNS = (
 
 
 def cells(cost: Cost) -> tuple[str, ...]:
-    """A row of the table."""
+    """The row of the table, as text."""
     time = "unknown" if cost.seconds is None else hours(cost.seconds)
     size = "unknown" if cost.parameters is None else f"{cost.parameters / 1e6:.2f} M"
     return (cost.label, cost.task, time, size, f"{cost.steps:,}")
 
 
 def hours(seconds: float) -> str:
-    """A time in words."""
+    """A time as text: "1.25 h", or "3.2 min"."""
     return f"{seconds / 3600:.2f} h" if seconds >= 600 else f"{math.ceil(seconds / 6) / 10:.1f} min"
 
 

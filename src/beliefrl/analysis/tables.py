@@ -1,4 +1,4 @@
-"""Tables of text as files: Markdown to read, LaTeX to print, both there whole or not at all."""
+"""Tables as files: Markdown for reading and LaTeX for print. No file is left half written."""
 
 import pathlib
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from beliefrl.types import UserError
 
 class Column(NamedTuple):
     heading: str
-    is_number: bool = False  # set flush right
+    is_number: bool = False  # aligned right
 
 
 Cells = Sequence[str]
@@ -24,7 +24,7 @@ def markdown(columns: Sequence[Column], rows: Sequence[Cells]) -> str:
 
 
 def latex(columns: Sequence[Column], rows: Sequence[Cells]) -> str:
-    """The table in LaTeX, for the package booktabs."""
+    """The table in LaTeX; it needs the package booktabs."""
 
     def line(cells: Cells) -> str:
         kept = (cell.replace("_", r"\_").replace("%", r"\%").replace("±", r"$\pm$") for cell in cells)

@@ -1,4 +1,4 @@
-"""What each command does: parse its options, call the library, print. A command is a function and a line here."""
+"""The commands of the command line. Each is a function that parses options, calls the library and prints."""
 
 from collections.abc import Callable, Sequence
 

@@ -1,4 +1,4 @@
-"""What stands behind a command: its options, read with tyro, and its mistakes, put as sentences."""
+"""Parse the arguments of a command with tyro, and report mistakes as clear sentences."""
 
 import contextlib
 import dataclasses
@@ -15,7 +15,7 @@ from beliefrl.commands.values import VALUES
 
 
 class UsageError(Exception):
-    """A mistake on the command line, as a sentence."""
+    """A mistake on the command line; the message is one sentence."""
 
 
 OwnAgent = Annotated[
@@ -35,7 +35,7 @@ def own_agent(name: str | None) -> type | None:
 
 
 def agent_options(agent: Any, own: dict[str, Any]) -> type:
-    """The options of a command: its own, (type, default) each, and the hyperparameters of an agent, if there is one."""
+    """A dataclass of a command's options: its own {name: (type, default)}, and the hyperparameters of `agent`."""
     fields = [(name, kind, dataclasses.field(default=default)) for name, (kind, default) in own.items()]
     if agent is None:
         return dataclasses.make_dataclass("Options", fields, frozen=True)
@@ -49,20 +49,20 @@ def agent_options(agent: Any, own: dict[str, Any]) -> type:
 
 
 def agent_name(argv: Sequence[str], command: str, more: str = "") -> tuple[str, Sequence[str]]:
-    """The agent's name and what follows it."""
+    """The name of the agent, and the remaining arguments."""
     usage = f"beliefrl {command} AGENT {more}".rstrip()
     if argv and argv[0] in ("-h", "--help"):
         print(f"usage: {usage} ...\n")
-        print(f"`beliefrl agents` lists the agents; name one to see its options: beliefrl {command} vrm --help")
-        print("MODULE:CLASS is an agent of your own, in this folder or on the Python path.")
+        print(f"`beliefrl agents` lists the agents. To see the options of one: beliefrl {command} vrm --help")
+        print("MODULE:CLASS is an agent of your own, in the current folder or on the Python path.")
         raise SystemExit(0)
     if not argv or argv[0].startswith("-"):
-        raise UsageError(f"No agent is named: write {usage}; `beliefrl agents` lists them.")
+        raise UsageError(f"No agent is given: write {usage}; `beliefrl agents` lists the agents.")
     return argv[0], argv[1:]
 
 
 def parse(options: Any, argv: Sequence[str], prog: str) -> Any:
-    """Options from the command line; a mistake becomes a sentence instead of tyro's box."""
+    """Parse the options. A mistake raises a UsageError with one sentence, instead of tyro's box."""
     if any(arg in ("-h", "--help") for arg in argv):
         return tyro.cli(options, prog=prog, args=argv, registry=VALUES)
     box = io.StringIO()
@@ -70,21 +70,23 @@ def parse(options: Any, argv: Sequence[str], prog: str) -> Any:
         with contextlib.redirect_stderr(box), contextlib.redirect_stdout(box):
             parsed, unknown = tyro.cli(options, prog=prog, args=argv, return_unknown_args=True, registry=VALUES)
     except SystemExit:
-        raise UsageError(f"{_sentence(box.getvalue())}; `{prog} --help` shows what can be given.") from None
+        raise UsageError(f"{_sentence(box.getvalue())}; `{prog} --help` shows the options.") from None
     if unknown:
         raise UsageError(_unknown(options, unknown[0], prog))
     return parsed
 
 
 def named_values(given: Sequence[str], option: str) -> dict[str, Any]:
-    """{"name": value} of NAME=VALUE; a value is read as JSON, or else it is a string."""
+    """{"name": value} of NAME=VALUE arguments. A value is parsed as JSON; if that fails, it is a string."""
     values = {}
     for each in given:
         name, separator, value = each.partition("=")
         if not (separator and name.isidentifier()):
             raise UsageError(f"{option} {each} cannot be understood: write NAME=VALUE, such as max_episode_steps=500.")
-        if name in ("name", "observe"):  # arguments of `tasks.make` beside the constants
-            raise UsageError(f"{option} {each} is impossible: the task's name and --observe are given apart.")
+        if name in ("name", "observe"):  # arguments of `tasks.make` that are not constants
+            raise UsageError(
+                f"{option} {each} is impossible: name and observe are not constants of a task: use TASK and --observe."
+            )
         try:
             values[name] = json.loads({"True": "true", "False": "false", "None": "null"}.get(value, value))
         except ValueError:
@@ -92,7 +94,7 @@ def named_values(given: Sequence[str], option: str) -> dict[str, Any]:
     return values
 
 
-WORDING = (  # tyro's, Python's, and ours
+WORDING = (  # message of tyro or Python: our message
     (r"Missing from .*: (\w+) .*", r"\1 is missing"),
     (r"Error parsing (\S+): (must be .*)", r"\1 \2"),
     (r"Error parsing (\S+): could not convert string to float: (.*)", r"\1 must be a number, not \2"),
@@ -103,27 +105,27 @@ WORDING = (  # tyro's, Python's, and ours
 
 
 def _sentence(box: str) -> str:
-    """The first paragraph below the title of a box that tyro drew, on one line and in our words."""
-    lines = [line.strip(" │|╭╮╰╯─-") for line in box.splitlines()[1:]]  # rules become empty
+    """The first paragraph of an error box of tyro, on one line and in our wording."""
+    lines = [line.strip(" │|╭╮╰╯─-") for line in box.splitlines()[1:]]  # frame lines become empty
     paragraphs = " ".join(line or "\n" for line in lines).split("\n")
     message = next(filter(str.strip, paragraphs), "That command line cannot be understood").strip().rstrip(". ")
-    for theirs, ours in WORDING:
-        message = re.sub(f"^{theirs}$", ours, message)
+    for pattern, wording in WORDING:
+        message = re.sub(f"^{pattern}$", wording, message)
     return message
 
 
 def _unknown(options: Any, given: str, prog: str) -> str:
-    """What to say of an argument that no option takes."""
+    """The error message for an argument that does not belong to any option."""
     if not given.startswith("-"):
-        return f"There is one argument too many, {given!r}: `{prog} --help` shows what can be given."
+        return f"There is one argument too many, {given!r}: `{prog} --help` shows the usage."
     names = [f"--{name.replace('_', '-')}" for name in _option_names(options)]
     near = difflib.get_close_matches(given.split("=")[0], names, n=1)
-    hint = f"did you mean {near[0]}?" if near else f"`{prog} --help` shows them."
+    hint = f"did you mean {near[0]}?" if near else f"`{prog} --help` lists the options."
     return f"There is no option {given}: {hint}"
 
 
 def _option_names(options: Any) -> list[str]:
-    """Every field of a dataclass and of the dataclasses in it."""
+    """The names of all fields of a dataclass and of the dataclasses in it."""
     names = []
     for field in dataclasses.fields(options):
         kind = getattr(field.type, "__origin__", field.type)

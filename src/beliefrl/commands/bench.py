@@ -22,8 +22,8 @@ def bench(argv: Sequence[str]) -> None:
         return Annotated[kind, tyro.conf.arg(help=help)], default
 
     own = {
-        "obs": option(int, 6, "Numbers in an observation; the default is velocities-only Hopper's."),
-        "actions": option(int, 3, "Degrees of freedom; the default is Hopper's."),
+        "obs": option(int, 6, "Size of the observation; the default is that of velocities-only Hopper."),
+        "actions": option(int, 3, "Size of the action; the default is that of Hopper."),
         "seeds": option(int, 1, "Seeds trained side by side in one program."),
         "json": option(bool, False, "Print one JSON object."),
     }

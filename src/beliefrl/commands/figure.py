@@ -14,16 +14,16 @@ KINDS = ("curves", "run", "ablation", "sensitivity", "elbo", "aggregate", "scala
 TABLES = ("scalability", "table")
 HELP = """usage: beliefrl figure KIND RUNS ... [--out FILE]
 
-  curves        learning curves: mean and S.E.M. over seeds, a line an agent, a panel a task (Section 5)
-  run           one run: sampled and mode actions, with a thin line a seed; its curve.png
-  ablation      the curves of VRM and its ablations (Appendix C)
-  sensitivity   VRM with the paper's and with drawn settings (Appendix F; runs of `sweep --preset sensitivity`)
-  elbo          return beside the negative ELBO of the keep-learning model (Section 5.4)
+  curves        learning curves: mean and S.E.M. over seeds, one line per agent, one panel per task (Section 5)
+  run           one run, as in its curve.png: sampled and mode actions, with a thin line for each seed
+  ablation      learning curves of VRM and its ablations (Appendix C)
+  sensitivity   VRM with the paper's settings and with drawn ones (Appendix F; runs of `sweep --preset sensitivity`)
+  elbo          return, and negative ELBO of the keep-learning model (Section 5.4)
   aggregate     interquartile means and performance profiles over tasks, with bootstrap intervals
-  scalability   wall-clock time and parameters, as Markdown and LaTeX (Appendix G)
-  table         returns at the end, when a task was solved, wall-clock time: as Markdown and LaTeX
+  scalability   a table of wall-clock time and parameters, as Markdown and LaTeX (Appendix G)
+  table         a table of final returns, solved tasks and wall-clock time, as Markdown and LaTeX
 
-RUNS are runs, folders that hold runs, such as a sweep's, or files of results, NAME.json.gz.
+RUNS are folders of runs, folders that contain runs (such as a sweep's), or files of results, NAME.json.gz.
 `beliefrl figure KIND --help` shows the options.
 """
 
@@ -35,21 +35,22 @@ class FigureOptions:
     runs: Annotated[
         tyro.conf.Positional[tuple[pathlib.Path, ...]], tyro.conf.arg(metavar="RUNS", help_behavior_hint="(required)")
     ]
-    """Runs, folders that hold runs, such as a sweep's, or files of results, NAME.json.gz."""
+    """Folders of runs, folders that contain runs (such as a sweep's), or files of results, NAME.json.gz."""
     out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """The file, without an ending or with .png or .pdf (scalability, table: .md or .tex). None: KIND in this folder."""
+    """The file to write, with or without the suffix. None: KIND in the current folder. Figures are written as .png and
+    .pdf, tables as .md and .tex."""
     actions: Literal["sampled", "mode"] = "sampled"
-    """Returns with sampled actions (the paper) or with the policy's mode."""
+    """Show returns with sampled actions (as the paper does), or with the policy's mode."""
     tasks: tuple[str, ...] = ()
-    """Only these tasks."""
+    """Include only these tasks. Empty: all."""
     agents: tuple[str, ...] = ()
-    """Only these agents."""
+    """Include only these agents. Empty: all."""
     names: tuple[str, ...] = ()
-    """Only runs whose folder has one of these names; * and ? stand for anything, as in 'vrm-*-seed0'."""
+    """Include only runs with these folder names. Wildcards are * and ?, as in 'vrm-*-seed0'."""
     until: int | None = None
-    """Only evaluations up to so many environment steps. None: all."""
+    """Include only evaluations up to this number of environment steps. None: all."""
     unfinished: bool = False
-    """Also runs that have not come to their end, as far as all seeds of an agent have come."""
+    """Include unfinished runs. A curve ends at the last step that all its seeds have reached."""
 
 
 def figure(argv: Sequence[str]) -> None:
@@ -58,7 +59,7 @@ def figure(argv: Sequence[str]) -> None:
         print(HELP, end="")
         return
     if not argv or argv[0] not in KINDS:
-        given = f"There is no figure {argv[0]!r}" if argv else "No figure is named"
+        given = f"There is no figure {argv[0]!r}" if argv else "No figure is given"
         raise UsageError(f"{given}: write beliefrl figure KIND RUNS, where KIND is {', '.join(KINDS)}.")
     kind = argv[0]
     options = parse(FigureOptions, argv[1:], f"beliefrl figure {kind}")
@@ -73,7 +74,7 @@ def figure(argv: Sequence[str]) -> None:
 
 
 def _draw(kind: str, runs: Sequence[Any], out: pathlib.Path, actions: str) -> pathlib.Path:
-    """Write the figure; returns the path of its PNG, or of the table in Markdown."""
+    """Write the figure or table; returns the path of the PNG or of the Markdown file."""
     from beliefrl import agents
     from beliefrl.analysis import aggregate, elbo, final, panels, scalability
     from beliefrl.analysis.curves import curve_figure
@@ -84,7 +85,9 @@ def _draw(kind: str, runs: Sequence[Any], out: pathlib.Path, actions: str) -> pa
 
     if kind == "run":
         if len(runs) > 1:
-            raise UserError(f"A run is one: choose one of these {len(runs)} by --names, --agents or --tasks.")
+            raise UserError(
+                f"This figure shows one run: choose one of these {len(runs)} by --names, --agents or --tasks."
+            )
         return save(curve_figure(runs[0]), out)
     lines = groups(runs, agents.defaults())
     if kind in TABLES:
@@ -99,28 +102,28 @@ def _draw(kind: str, runs: Sequence[Any], out: pathlib.Path, actions: str) -> pa
 
 
 def _runs(options: FigureOptions, kind: str) -> tuple[list[Any], list[str]]:
-    """The chosen runs, and a sentence for each file that is damaged and each run that is left out."""
+    """The selected runs, and one sentence for each damaged file and each run that is left out."""
     from beliefrl.analysis import groups, results
     from beliefrl.types import UserError
 
     if not options.runs:
-        raise UsageError("RUNS is missing: give runs, folders that hold runs, or files of results.")
+        raise UsageError("RUNS is missing: give runs, folders that contain runs, or files of results.")
     found = groups.find(options.runs)
     chosen = [run for run in found.runs if _is_chosen(run, options, kind)]
     drawn = [run for run in chosen if options.unfinished or groups.is_finished(run)]
     if not drawn:
-        raise UserError(f"None of the {len(found.runs)} runs can be drawn: none that was asked for is finished.")
+        raise UserError(
+            f"None of the {len(found.runs)} runs is both selected and finished: select others, or add --unfinished."
+        )
     notes = [f"damaged: {why}" for why in found.damage]
     notes += [
-        f"left out: {run.folder} is not finished (--unfinished draws it as far as it has come)"
-        for run in chosen
-        if run not in drawn
+        f"left out: {run.folder} is not finished (--unfinished includes it)" for run in chosen if run not in drawn
     ]
     return drawn if options.until is None else [results.cut(run, options.until) for run in drawn], notes
 
 
 def _is_chosen(run: Any, options: FigureOptions, kind: str) -> bool:
-    """Whether a run has one of the tasks, agents and names that were asked for, and suits the figure."""
+    """Whether the options select a run, and the figure can show it."""
     agent, task, name = run.config["agent"], run.config["task"], run.folder.name
     return (
         (not options.tasks or task in options.tasks)

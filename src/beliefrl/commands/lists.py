@@ -1,4 +1,4 @@
-"""What there is: `beliefrl tasks` and `beliefrl agents`."""
+"""Lists of names: `beliefrl tasks` and `beliefrl agents`."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ from beliefrl.commands.arguments import parse
 
 @dataclasses.dataclass(frozen=True)
 class ListOptions:
-    """Print the names, one a line."""
+    """Print all names with their descriptions."""
 
 
 def list_tasks(argv: Sequence[str]) -> None:

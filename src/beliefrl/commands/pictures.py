@@ -1,4 +1,4 @@
-"""What a trained agent believes and does: `beliefrl predict`, `video` and `film`."""
+"""Pictures of trained agents: `beliefrl predict`, `video` and `film`."""
 
 import dataclasses
 import pathlib
@@ -12,74 +12,74 @@ from beliefrl.commands.arguments import OwnAgent, own_agent, parse
 
 @dataclasses.dataclass(frozen=True)
 class PredictOptions:
-    """Draw what a run's model predicts of an episode, beside the truth: open loop and closed loop, with their σ."""
+    """Compare the predictions of a run's model with a true episode: open loop and closed loop, with σ."""
 
     run: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
     out: pathlib.Path | None = None
-    """The picture, written as PNG and as PDF. None: predictions.png in the run's folder."""
+    """The picture to write, as PNG and as PDF. None: predictions.png in the run's folder."""
     model: str | None = None
-    """Which model: keep or first of vrm, latent of slac. None: the first of these that the agent has."""
+    """The model to use: keep or first for vrm, latent for slac. None: the first of these that the agent has."""
     start: int | None = None
-    """Moments that the closed loop sees. None: 50, or half of a shorter episode."""
+    """Number of time steps that the closed loop observes. None: 50, or half of a shorter episode."""
     horizon: int = 100
-    """Moments that it predicts then, as far as the episode goes."""
+    """Number of time steps that the closed loop predicts after that, at most to the end of the episode."""
     samples: int = 32
-    """Draws whose mean each prediction is."""
+    """Number of samples in the mean of each prediction."""
     entries: tuple[int, ...] = ()
-    """Entries of the observation to draw, in the numbers of --observe. None given: the first six that are seen."""
+    """Entries of the observation to draw, numbered as in --observe. Empty: the first six that the agent sees."""
     seed: int | None = None
-    """Which of the run's seeds; None is its first."""
+    """One of the run's seeds. None: its first."""
     episode_seed: int = 0
-    """Of the episode, its actions and the draws: the same one gives the same picture."""
+    """Random seed of the episode, its actions and the samples. The same seed gives the same picture."""
     sampled: bool = False
-    """Actions are sampled; else they are the policy's mode."""
+    """Sample the actions, instead of taking the policy's mode."""
     agent: OwnAgent = None
 
 
 @dataclasses.dataclass(frozen=True)
 class VideoOptions:
-    """Film episodes of what a run has learned."""
+    """Record a video of a run's trained agent."""
 
     run: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
     out: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="FILE")]
-    """The film, .mp4 (extra `video`) or .gif; one that is there is replaced."""
+    """The video to write, .mp4 (needs the extra `video`) or .gif. An existing file is replaced."""
     episodes: int = 1
-    """How many, one after the other."""
+    """Number of episodes, shown one after the other."""
     fps: float | None = None
-    """Steps in a second of the film. None: real time, where steps beyond 50 a second are left out."""
+    """Time steps per second of the video. None: real time, with at most 50 frames per second."""
     steps: int | None = None
-    """End each episode after so many; None: when the task does."""
+    """Stop each episode after this many steps. None: play until the task ends it."""
     seed: int | None = None
-    """Which of the run's seeds; None is its first."""
+    """One of the run's seeds. None: its first."""
     episode_seed: int = 0
-    """Of the first episode; the next ones have the numbers that follow."""
+    """Random seed of the first episode. The next episodes have the following seeds."""
     sampled: bool = False
-    """Actions are sampled; else they are the policy's mode."""
+    """Sample the actions, instead of taking the policy's mode."""
     agent: OwnAgent = None
 
 
 @dataclasses.dataclass(frozen=True)
 class FilmOptions:
-    """Draw a film strip: frames of an episode, evenly spaced in time; a row for each run."""
+    """Draw a film strip: evenly spaced frames of an episode, one row per run."""
 
     runs: Annotated[
         tyro.conf.Positional[tuple[pathlib.Path, ...]], tyro.conf.arg(metavar="RUN", help_behavior_hint="(required)")
     ]
-    """The runs' folders."""
+    """The folders of the runs."""
     out: pathlib.Path | None = None
-    """The strip, written as PNG and as PDF. None: film.png in the first run's folder."""
+    """The strip to write, as PNG and as PDF. None: film.png in the first run's folder."""
     frames: int = 8
-    """In a row."""
+    """Number of frames in a row."""
     steps: int | None = None
-    """End the episodes after so many; None: when the task does."""
+    """Stop the episodes after this many steps. None: play until the task ends them."""
     seed: int | None = None
-    """Which of each run's seeds; None is its first."""
+    """One of each run's seeds. None: its first."""
     episode_seed: int = 0
-    """Of the episodes: the same one gives the same strip."""
+    """Random seed of the episodes. The same seed gives the same strip."""
     sampled: bool = False
-    """Actions are sampled; else they are the policy's mode."""
+    """Sample the actions, instead of taking the policy's mode."""
     agent: OwnAgent = None
 
 
@@ -92,7 +92,7 @@ def predict(argv: Sequence[str]) -> None:
 
     run = Run(options.run)
     path = options.out or run.folder / "predictions.png"
-    figures.paths(path)  # before an episode is played for it
+    figures.paths(path)  # raises an error before the episode is played
     names = ("seed", "model", "start", "horizon", "samples", "episode_seed", "sampled")
     predicted = predictions(run, agent=own_agent(options.agent), **{name: getattr(options, name) for name in names})
     _written(draw_predictions(predicted, path, options.entries or None))

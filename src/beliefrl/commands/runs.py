@@ -1,4 +1,4 @@
-"""What is asked of a run: `beliefrl show`, `evaluate` and `export`."""
+"""Commands on a run: `beliefrl show`, `evaluate` and `export`."""
 
 import dataclasses
 import json
@@ -13,35 +13,35 @@ from beliefrl.commands.arguments import OwnAgent, own_agent, parse
 
 @dataclasses.dataclass(frozen=True)
 class EvaluateOptions:
-    """Play new episodes with what a run has learned, with sampled actions and with mode actions."""
+    """Evaluate a run's trained agent in new episodes, with sampled actions and with mode actions."""
 
     run: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
     episodes: int = 20
-    """Episodes for each seed of the run and each mode."""
+    """Number of episodes for each of the run's seeds and each kind of actions (sampled, mode)."""
     seed: int = 0
-    """Of these episodes: the same seed gives the same numbers."""
+    """Random seed of the episodes. The same seed gives the same results."""
     json: bool = False
-    """Print one JSON object: per mode the mean, S.E.M., every seed's mean, and success."""
+    """Print one JSON object: for each kind of actions the mean, S.E.M., mean of each seed, and success rates."""
     agent: OwnAgent = None
 
 
 @dataclasses.dataclass(frozen=True)
 class ExportOptions:
-    """Write what a run has learned as one file that jax loads without this library (`beliefrl.Policy.export`)."""
+    """Write a run's policy to one file that jax loads without this library (`beliefrl.Policy.export`)."""
 
     run: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
     file: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="FILE")]
-    """The file to write; one that is there is replaced."""
+    """The file to write. An existing file is replaced."""
     seed: int | None = None
-    """Which of the run's seeds; None is its first."""
+    """One of the run's seeds. None: its first."""
     agent: OwnAgent = None
 
 
 @dataclasses.dataclass(frozen=True)
 class ShowOptions:
-    """Show what a run was made with, how far it is, and what it is worth."""
+    """Show the settings, the progress and the results of a run."""
 
     run: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
@@ -81,7 +81,7 @@ def evaluate(argv: Sequence[str]) -> None:
     if options.json:
         print(json.dumps(results))
         return
-    title = f"{run.config['agent']} on {run.config['task']}, {options.episodes} episodes a seed"
+    title = f"{run.config['agent']} on {run.config['task']}, {options.episodes} episodes per seed"
     Console().print(results_table(results, run.seeds, title))
 
 

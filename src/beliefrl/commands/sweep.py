@@ -13,42 +13,42 @@ from beliefrl.commands.arguments import UsageError, named_values, parse
 
 @dataclasses.dataclass(frozen=True)
 class SweepOptions:
-    """Many trainings: agents x tasks x settings x seeds, as many at a time as there are cores, one thread each (or one
-    a GPU). A sweep that was stopped goes on by the same command, or by --out alone; finished trainings are not done
-    again; one that fails is told at the end, and the others go on.
+    """Run many trainings: agents x tasks x settings x seeds, one training per core or GPU at a time. A stopped sweep
+    continues with the same command, or with --out alone. Finished trainings are not repeated. If a training fails, the
+    others continue, and the failure is reported at the end.
     """
 
     file: Annotated[tyro.conf.Positional[pathlib.Path | None], tyro.conf.arg(metavar="FILE.py")] = None
-    """A Python file that makes a list `experiments`, by `beliefrl.grid` or of `beliefrl.Experiment`."""
+    """A Python file that defines a list `experiments` of `beliefrl.Experiment`, for example with `beliefrl.grid`."""
     preset: Literal["classic", "robots", "memory", "ablation", "sensitivity", "scalability"] | None = None
-    """The paper's experiments (Section 5, Appendices C, F, G); --tasks, --agents, --seeds replace its own."""
+    """Experiments of the paper (Section 5, Appendices C, F, G); --tasks, --agents, --seeds replace the paper's."""
     agents: tuple[str, ...] = ()
-    """Names of agents."""
+    """Names of the agents."""
     tasks: tuple[str, ...] = ()
-    """Names of tasks."""
+    """Names of the tasks."""
     seeds: int | None = None
-    """Seeds of every experiment, from --seed on. None: as many as the paper has (5; sensitivity 20), 2 with --scale."""
+    """Number of seeds per experiment, starting at --seed. None: as in the paper (5; sensitivity 20), 2 with --scale."""
     seed: int = 0
     """Number of the first seed."""
     steps: int | None = None
-    """Environment steps of each seed. None: the preset's, or 20,000."""
+    """Environment steps per seed. None: those of the preset, or 20,000."""
     set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE[,VALUE...]")] = ()
-    """Hyperparameters of the agents, options of a training; of those with several values every combination is run."""
+    """Hyperparameters of the agents, or training options. Every combination of the given values is trained."""
     observe: Annotated[tuple[str, ...], tyro.conf.arg(metavar="ENTRIES")] = ()
     """Entries of the observation that the agents see, as in `beliefrl train`."""
     constants: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
     """The tasks' constants, as in `beliefrl train`."""
     scale: float = 1.0
-    """A trial: so many times the steps, the exploration, the pre-training and the steps between evaluations."""
+    """Scale all step counts, for a quick trial: training, exploration, pre-training, evaluation interval (0 to 1)."""
     out: pathlib.Path | None = None
-    """The sweep's folder; one that holds a sweep goes on. None: runs/sweep, or runs/sweep-PRESET."""
+    """The sweep's folder. A sweep that is in it continues. None: runs/sweep, or runs/sweep-PRESET."""
     workers: int | None = None
-    """Most trainings at a time. None: as many as there are cores (or GPUs)."""
+    """Maximum number of trainings at a time. None: as many as there are cores (or GPUs)."""
     seeds_per_run: int | None = None
-    """Seeds trained side by side in one program. None: one on a core (of sac-mlp all), all on a GPU."""
+    """Maximum number of seeds side by side in one program. None: one on a core (sac-mlp: all), all on a GPU."""
     ray: Annotated[str | None, tyro.conf.arg(metavar="auto|ADDRESS")] = None
-    """Run on the Ray cluster whose head is at ADDRESS (HOST:PORT), or on this machine (auto). Needs the extra `sweep`,
-    and a folder that all of its machines see."""
+    """Run on a Ray cluster. ADDRESS is HOST:PORT of its head, or auto for a head on this machine. Needs the extra
+    `sweep`, and a folder that all machines of the cluster see."""
 
 
 def sweep(argv: Sequence[str]) -> None:
@@ -74,7 +74,7 @@ def sweep(argv: Sequence[str]) -> None:
 
 
 def _experiments(options: SweepOptions) -> list:
-    """What the command line asks for."""
+    """The experiments that the options define. Empty: continue the sweep in --out."""
     from beliefrl.runs.options import Options
     from beliefrl.sweeps import files, plan, presets
     from beliefrl.types import check_range
@@ -88,25 +88,25 @@ def _experiments(options: SweepOptions) -> list:
     numbers = None if count is None else range(options.seed, options.seed + count)
     if options.file is not None:
         if options.preset or options.agents or options.tasks:
-            raise UsageError("A FILE says which agents and tasks: leave --preset, --agents and --tasks out.")
+            raise UsageError("FILE defines the agents and tasks: leave --preset, --agents and --tasks out.")
         chosen = files.load(options.file)
         chosen = [dataclasses.replace(each, seeds=tuple(numbers)) for each in chosen] if numbers else chosen
     elif options.preset is not None:
         chosen = presets.preset(options.preset, options.tasks, options.agents, numbers)
     elif options.agents and options.tasks:
         chosen = plan.grid(options.agents, options.tasks, seeds=numbers or range(options.seed, options.seed + 5))
-    elif options.out is not None and _only_where(options) and files.read(options.out):
+    elif options.out is not None and _only_continues(options) and files.read(options.out):
         return []
     else:
         raise UsageError(
-            "Nothing is named to run: give --preset, or --agents and --tasks, or a FILE, or an --out to go on."
+            "There is nothing to run: give --preset, or --agents and --tasks, or FILE, or the --out of a sweep."
         )
     chosen = _with_settings(chosen, options)
     return chosen if options.scale == 1 else [plan.shrunk(each, options.scale) for each in chosen]
 
 
-def _only_where(options: SweepOptions) -> bool:
-    """Whether nothing is said but where a sweep is and how it shall run."""
+def _only_continues(options: SweepOptions) -> bool:
+    """Whether the options only say which sweep to continue, and on which machines or cores."""
     where = dataclasses.replace(SweepOptions(), out=options.out, workers=options.workers, ray=options.ray)
     return options == dataclasses.replace(where, seeds_per_run=options.seeds_per_run)
 
@@ -135,11 +135,11 @@ def _with_settings(experiments: list, options: SweepOptions) -> list:
 def _named(given: str) -> tuple[str, str]:
     name, separator, value = given.partition("=")
     name = name.replace("-", "_")
-    named_values([name + separator + value], "--set")  # complains of what is no NAME=VALUE
+    named_values([name + separator + value], "--set")  # raises an error unless it is NAME=VALUE
     return name, value
 
 
 def _values(text: str) -> list:
-    """The values of A,B,C; one list in brackets is one value."""
+    """The values in A,B,C. A list in brackets is one value."""
     parts = [text] if text.startswith("[") else text.split(",")
     return [named_values([f"value={part}"], "--set")["value"] for part in parts]

@@ -1,4 +1,4 @@
-"""How values are read from the command line, and shown in its help, where tyro's own ways are not ours."""
+"""Value types that the command line parses or shows differently from tyro's defaults."""
 
 import dataclasses
 from decimal import Decimal, InvalidOperation
@@ -11,10 +11,10 @@ VALUES = ConstructorRegistry()
 
 
 def whole_number(text: str) -> int:
-    """A whole number, also as 20_000 or 1e4.
+    """Parse a whole number, also as 20_000 or 1e4.
 
     Raises:
-        ValueError: it is none, such as 1.5.
+        ValueError: it is not a whole number, such as 1.5.
     """
     try:
         number = Decimal(text)
@@ -40,7 +40,7 @@ def _whole_number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[int] | No
 
 @VALUES.primitive_rule
 def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-    """T | None is shown as T, and takes None as well."""
+    """Show T | None as T, and accept None as well."""
     inner = [kind for kind in get_args(info.type) if kind is not NoneType]
     if info.type_origin not in (Union, UnionType) or len(inner) != 1:
         return None
@@ -58,7 +58,7 @@ def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
 
 @VALUES.primitive_rule
 def _several(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-    """tuple[T, ...] whose default is empty is shown with the default none."""
+    """Show the empty default of tuple[T, ...] as "none"."""
     if info.type_origin is not tuple or get_args(info.type)[1:] != (...,):
         return None
     as_list: Any = list[get_args(info.type)[0]]

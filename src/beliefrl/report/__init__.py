@@ -1,9 +1,9 @@
-"""Runs on one page of HTML that needs nothing else: no network, no server, no other file.
+"""A report on runs: one HTML page that needs no network and no server.
 
-`data` says what is told; page.html, page.css, curves.js and page.js how it looks. The page's only content is JSON,
-which the script puts in place as text, never as HTML: a run's folder may come from a stranger. The page's own policy
-(Content-Security-Policy) holds the browser to that: no script but ours runs, and nothing is fetched but pictures and
-videos from where the page lies.
+`data` computes the content; page.html, page.css, curves.js and page.js render it. The content is embedded as JSON. The
+script inserts it as text, never as HTML, because the source of a run's folder may be untrusted. The page's
+Content-Security-Policy enforces this: the browser runs no other script, and loads only pictures and videos from the
+page's own location.
 """
 
 import base64
@@ -19,7 +19,7 @@ from string import Template
 from typing import Any
 
 from beliefrl.analysis.groups import find
-from beliefrl.report.data import ReadOnce, told
+from beliefrl.report.data import CachedRun, page_data
 from beliefrl.runs.arrays import write_whole
 from beliefrl.types import UserError
 
@@ -30,26 +30,28 @@ def write_report(
     unfinished: bool = False,
     note: Callable[[str], None] | None = None,
 ) -> pathlib.Path:
-    """Write the report of all runs in these folders; returns the page's path. A page that is there is replaced.
+    """Write a report on all runs in these folders; returns the path of the page. An existing page is replaced.
 
-    A run that cannot be read is left out, and so are damaged lines of a log; the page says so.
+    Runs that cannot be read and damaged lines of logs are left out. The page lists them.
 
     Args:
-        paths: folders that are runs or hold runs, however deep, and files of results, NAME.json.gz.
-        out: the page, NAME.html. Links to videos and pictures are relative to where it lies.
-        unfinished: runs that are not finished count as well.
-        note: called with a sentence for each run that cannot be read, and for each log with damaged lines.
+        paths: runs, folders with runs at any depth, and files of results, NAME.json.gz.
+        out: the page, NAME.html. Its links to videos and pictures are relative to its folder.
+        unfinished: whether curves and tables include unfinished runs.
+        note: called with one sentence for each unreadable run, and for each log with damaged lines.
 
     Raises:
         UserError: there is no run in a folder, none of the runs can be read, or the page cannot be written.
     """
     out = pathlib.Path(out)
     if out.suffix not in (".html", ".htm"):
-        raise UserError(f"The report is a page, which {out} is not called like: call it {out.with_suffix('.html')}.")
-    if not os.path.isdir(out.parent):  # noqa: PTH112 - pathlib's raises where a name is too long
-        raise UserError(f"There is no folder {out.parent} to write {out.name} into: make it, or choose another --out.")
-    found = find(paths, ReadOnce)
-    content = page(told(found.runs, out.parent, unfinished) | {"damage": found.damage})
+        raise UserError(f"{out} must end in .html: give {out.with_suffix('.html')}, for example.")
+    if not os.path.isdir(out.parent):  # noqa: PTH112 - pathlib's version raises if a name is too long
+        raise UserError(
+            f"There is no folder {out.parent} to write {out.name} into: create it, or choose another --out."
+        )
+    found = find(paths, CachedRun)
+    content = page(page_data(found.runs, out.parent, unfinished) | {"damage": found.damage})
     try:
         write_whole(out, content.encode())
     except OSError as error:
@@ -61,7 +63,7 @@ def write_report(
 
 
 def page(data: dict[str, Any]) -> str:
-    """The page that shows `data`."""
+    """The HTML of the page that shows `data`."""
     files = resources.files(__name__)
     style, *scripts = ((files / name).read_text(encoding="utf-8") for name in ("page.css", "curves.js", "page.js"))
     script = "\n".join(scripts)
@@ -72,12 +74,12 @@ def page(data: dict[str, Any]) -> str:
         script=script,
         script_hash=_hash(script),
         title=html.escape(f"BeliefRL: {len(data['runs'])} runs"),
-        data=_as_text(data | about),
+        data=_as_json(data | about),
     )
 
 
-def _as_text(data: dict[str, Any]) -> str:
-    """JSON that nothing in it can end or turn into HTML; for what is not a finite number it has no word but null."""
+def _as_json(data: dict[str, Any]) -> str:
+    """JSON that is safe inside a script element; numbers that are not finite become null."""
     finite = json.loads(json.dumps(data), parse_constant=lambda _: None)
     text = json.dumps(finite, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")

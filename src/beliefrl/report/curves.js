@@ -1,6 +1,6 @@
 "use strict";
-// Elements, numbers and curves. page.js follows in the same script and makes the page of them, from the JSON in it.
-// Everything that comes from a run becomes text, never HTML.
+// Helpers for elements, numbers and curves. page.js follows in the same script and builds the page with them, from the
+// JSON in the page. Everything that comes from a run is inserted as text, never as HTML.
 const data = JSON.parse(document.getElementById("data").textContent);
 const at = (id) => document.getElementById(id);
 
@@ -42,7 +42,7 @@ function duration(seconds) {
 
 // Curves
 
-// Lines of one agent with different settings differ in their dashes too
+// Lines of one agent with different settings have different dashes, too
 const DASHES = ["", "7 4", "2 3", "8 3 2 3", "12 4"];
 const dashes = (label) => DASHES[data.labels.find((each) => each.name === label).dash % DASHES.length];
 function swatch(label) {
@@ -66,7 +66,7 @@ function short(value) {
   return Math.abs(value) >= 1e4 ? `${+(value / 1e3).toFixed(1)}k` : String(value);
 }
 
-// "M x,y L x,y ..."; a gap where there is no value
+// An SVG path "M x,y L x,y ..." with gaps where a value is missing
 function path(points) {
   let pen = "M";
   return points
@@ -132,7 +132,7 @@ class Panel {
     );
   }
 
-  // Lowest and highest value that is drawn
+  // The lowest and highest values that are drawn
   range() {
     const values = this.lines.flatMap(({ curve }) => [
       ...curve.mean.flatMap((mean, i) => (mean == null ? [] : [mean - curve.sem[i], mean + curve.sem[i]])),
@@ -212,7 +212,7 @@ class Panel {
     );
   }
 
-  // Show the numbers of every line that has an evaluation at a step; the best first
+  // Show the numbers of all lines with an evaluation at this step, the best first
   point(index) {
     this.index = index;
     this.tip.replaceChildren();

@@ -1,4 +1,4 @@
-"""What a report tells of runs, as plain values that are written as JSON: what is not a finite number becomes None."""
+"""The content of a report, as plain values for JSON. Numbers that are not finite become None."""
 
 import json
 import os
@@ -23,8 +23,8 @@ PICTURE = "curve.png"
 INTERVAL = 0.95
 
 
-class ReadOnce(Run):
-    """A run whose logs are read once, not for every question: of what a report asks for, its kinds of entries."""
+class CachedRun(Run):
+    """A run that reads its logs once and caches the kinds of rows that a report needs."""
 
     KINDS = ("evaluation", "diverged")
 
@@ -40,22 +40,24 @@ class ReadOnce(Run):
         return (row for row in self._rows[seed] if row["kind"] == kind)
 
 
-def told(runs: Sequence[Run], beside: pathlib.Path, unfinished: bool = False) -> dict[str, Any]:
-    """All that the page shows of `runs`; files in them are named as seen from the folder `beside`.
+def page_data(runs: Sequence[Run], page_folder: pathlib.Path, unfinished: bool = False) -> dict[str, Any]:
+    """Everything that the page shows about `runs`; paths of files are relative to the folder `page_folder`.
 
-    Curves and final returns are of runs that are finished; with `unfinished` also of others of which each seed has an
-    evaluation, and the curve of a group then ends where its shortest seed does.
+    Curves and final returns include finished runs only. With `unfinished` they also include runs in which each seed has
+    an evaluation; the curve of a group then ends at the last step that all its seeds have reached.
     """
     counted = [run for run in runs if is_finished(run) or (unfinished and _has_begun(run))]
     lines = [group for group in groups(counted, agents.defaults()) if group.curve().steps.size]
-    of = {(run.folder, seed): index for index, group in enumerate(lines) for run, seed in group.seeds}
+    group_of = {(run.folder, seed): index for index, group in enumerate(lines) for run, seed in group.seeds}
     palette = colours([group.label for group in lines])
     dash = dashes(list(palette))
     return {
         "tasks": list(dict.fromkeys(group.task for group in lines)),
         "labels": [{"name": label, "colour": colour, "dash": dash[label]} for label, colour in palette.items()],
         "groups": [_group(group) for group in lines],
-        "runs": [_run(run, beside, {seed: of.get((run.folder, seed)) for seed in run.seeds}) for run in runs],
+        "runs": [
+            _run(run, page_folder, {seed: group_of.get((run.folder, seed)) for seed in run.seeds}) for run in runs
+        ],
     }
 
 
@@ -84,7 +86,7 @@ def _group(group: Group) -> dict[str, Any]:
 
 
 def _curve(curve: Curve) -> dict[str, Any]:
-    """A curve's steps, each seed's values, and mean, S.E.M. and number of seeds at each step."""
+    """The steps of a curve, the values of each seed, and the mean, S.E.M. and number of seeds at each step."""
     columns = [statistics(column) for column in curve.seeds.T]
     return {
         "steps": curve.steps.tolist(),
@@ -94,19 +96,19 @@ def _curve(curve: Curve) -> dict[str, Any]:
 
 
 def statistics(seeds: np.ndarray) -> dict[str, Any]:
-    """Mean, S.E.M. and Student's 95 % interval for the mean over those seeds (seed,) that are finite numbers.
+    """Count, mean, S.E.M. and Student's 95 % interval of the mean, over the finite values of `seeds` (seed,).
 
-    S.E.M. and interval are None for one seed, all but `count` for none.
+    With one finite value, S.E.M. and interval are None; without any, the mean is None as well.
     """
-    there = seeds[np.isfinite(seeds)]
-    if there.size < 2:
-        return {"count": there.size, "mean": number(there[0]) if there.size else None, "sem": None, "interval": None}
+    finite = seeds[np.isfinite(seeds)]
+    if finite.size < 2:
+        return {"count": finite.size, "mean": number(finite[0]) if finite.size else None, "sem": None, "interval": None}
     from scipy.special import stdtrit
 
-    mean, error = float(there.mean()), float(standard_error(there))
-    half = float(stdtrit(there.size - 1, (1 + INTERVAL) / 2)) * error
+    mean, error = float(finite.mean()), float(standard_error(finite))
+    half = float(stdtrit(finite.size - 1, (1 + INTERVAL) / 2)) * error
     return {
-        "count": there.size,
+        "count": finite.size,
         "mean": number(mean),
         "sem": number(error),
         "interval": [number(mean - half), number(mean + half)],
@@ -114,11 +116,11 @@ def statistics(seeds: np.ndarray) -> dict[str, Any]:
 
 
 def number(value: float) -> float | None:
-    """To seven significant digits; None where it is not finite, for which JSON has no word."""
+    """The value with seven significant digits; None if it is not finite, since JSON has no such numbers."""
     return float(f"{value:.7g}") if np.isfinite(value) else None
 
 
-def _run(run: Run, beside: pathlib.Path, groups_of: dict[int, int | None]) -> dict[str, Any]:
+def _run(run: Run, page_folder: pathlib.Path, groups_of: dict[int, int | None]) -> dict[str, Any]:
     config = run.config
     sessions = [config, *config.get("resumed", ())]
     steps = {seed: last_step(run, seed) for seed in run.seeds}
@@ -137,22 +139,22 @@ def _run(run: Run, beside: pathlib.Path, groups_of: dict[int, int | None]) -> di
         "settings": settings(config),
         "sessions": [_session(session) for session in sessions],
         "config": json.dumps(config, indent=2),
-        "media": [_seen_from(beside, path) for path in _media(run.folder)],
+        "media": [_link(page_folder, path) for path in _media(run.folder)],
     }
 
 
 def settings(config: dict[str, Any]) -> list[str] | None:
-    """NAME=VALUE of the hyperparameters that are not the agent's own; None where this version has no such agent."""
-    own = agents.defaults().get(config["agent"])
-    if own is None:
+    """NAME=VALUE of the hyperparameters that differ from the agent's defaults; None if this version lacks the agent."""
+    defaults = agents.defaults().get(config["agent"])
+    if defaults is None:
         return None
     missing = object()
     given = config["hyperparameters"]
-    return [f"{name}={value}" for name, value in given.items() if own.get(name, missing) != value]
+    return [f"{name}={value}" for name, value in given.items() if defaults.get(name, missing) != value]
 
 
 def _session(session: dict[str, Any]) -> dict[str, str]:
-    """How a training was started or gone on with, in words."""
+    """When, where and how a session of a training ran, as text."""
     return {
         "started": str(session.get("started", "?")),
         "ended": str(session.get("ended", "?")),
@@ -167,6 +169,6 @@ def _media(folder: pathlib.Path) -> list[pathlib.Path]:
     return sorted(path for path in folder.rglob("*") if path.suffix in MEDIA or path == folder / PICTURE)
 
 
-def _seen_from(folder: pathlib.Path, path: pathlib.Path) -> dict[str, str]:
+def _link(folder: pathlib.Path, path: pathlib.Path) -> dict[str, str]:
     """A file's name, and its address relative to a page in `folder`."""
     return {"name": path.name, "address": quote(os.path.relpath(path, folder).replace(os.sep, "/"))}

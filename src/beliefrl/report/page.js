@@ -1,4 +1,4 @@
-// What is shown
+// Filters: which curves and rows are visible
 
 const form = at("filters");
 const chosen = (name) => new Set([...form.querySelectorAll(`[name=${name}]:checked`)].map((box) => box.value));
@@ -24,7 +24,7 @@ function chips(fieldset, name, values, mark) {
   }
 }
 
-// Tables: columns are [heading, value to sort by, cell or null for the value itself, whether a number]
+// Tables. A column is [heading, value for sorting, content of the cell (null: the value), is it a number]
 
 function table(element, columns, entries) {
   const rows = entries.map((entry) => {
@@ -66,13 +66,13 @@ function finalColumns() {
   const cell = (name, rate) => (group) => {
     const final = group.final[name];
     if (!final || final.mean == null) return "–";
-    const told = withError(final.mean, final.sem, rate);
+    const text = withError(final.mean, final.sem, rate);
     const mark = !rate && several(group.task) && final.mean === best(name, group.task);
     const interval =
       rate || !final.interval
         ? null
         : html("small", {}, final.interval.map((end) => plain(end, places(final.mean))).join(" to "));
-    return html("span", {}, mark ? html("b", {}, told) : told, interval);
+    return html("span", {}, mark ? html("b", {}, text) : text, interval);
   };
   const seeds = (group) => {
     const diverged = Object.entries(group.diverged).map(
@@ -95,45 +95,45 @@ function finalColumns() {
   ];
 }
 const list = (values) => values.join(", ");
-const told = (run) => `${run.agent} on ${run.task}`;
+const agentAndTask = (run) => `${run.agent} on ${run.task}`;
 const perSecond = (run) => (run.seconds && run.steps ? (run.steps * run.seeds.length) / run.seconds : null);
 const perStep = (run) => (run.seconds && run.steps ? (1000 * run.seconds) / run.steps : null);
 const device = (run) => list([...new Set(run.sessions.map((session) => session.device))]);
 const TIME = [
   ["run", (run) => run.folder],
-  ["agent and task", told],
+  ["agent and task", agentAndTask],
   ["seeds", (run) => run.seeds.length, null, true],
   ["steps", (run) => run.steps, (run) => whole(run.steps), true],
   ["wall-clock", (run) => run.seconds, (run) => duration(run.seconds), true],
-  ["ms a step", perStep, (run) => plain(perStep(run)), true],
+  ["ms/step", perStep, (run) => plain(perStep(run)), true],
   ["steps/s", perSecond, (run) => plain(perSecond(run)), true],
   ["device", device],
 ];
 const UNFINISHED = [
   ["run", (run) => run.folder],
-  ["agent and task", told],
+  ["agent and task", agentAndTask],
   ["seeds", (run) => list(run.seeds)],
   ["steps", (run) => run.steps, (run) => `${whole(run.steps)} of ${whole(run.of)}`, true],
   ["done", (run) => run.steps / run.of, (run) => (run.of ? percent(run.steps / run.of) : "?"), true],
 ];
 
-// Settings: what a run was made with is filled in when it is opened
+// Settings: the details of a run are created when the reader opens them
 
 function settings(run) {
   const changed =
     run.settings == null
-      ? "(an agent that this version does not know)"
+      ? "(this version does not know the agent)"
       : run.settings.length
         ? list(run.settings)
         : "defaults";
-  const fill = ({ target }) => target.open && target.children.length === 1 && target.append(...opened(run));
+  const fill = ({ target }) => target.open && target.children.length === 1 && target.append(...runDetails(run));
   return html(
     "details",
     { ontoggle: fill },
-    html("summary", {}, html("b", {}, run.folder), ` ${told(run)}: `, changed),
+    html("summary", {}, html("b", {}, run.folder), ` ${agentAndTask(run)}: `, changed),
   );
 }
-function opened(run) {
+function runDetails(run) {
   const facts = run.sessions.map((session, i) =>
     html(
       "dl",
@@ -149,14 +149,14 @@ function opened(run) {
   const notes = [
     ...run.diverged,
     ...(run.finished && run.not_counted.length
-      ? [`seeds ${list(run.not_counted)} count from another run of the same settings`]
+      ? [`seeds ${list(run.not_counted)} are taken from another run with the same settings`]
       : []),
   ];
   return [
     notes.length ? html("p", { class: "note" }, notes.join("; ")) : null,
     ...facts,
     html("div", { class: "media" }, run.media.map(medium)),
-    html("details", {}, html("summary", {}, "the whole configuration"), html("pre", { tabindex: 0 }, run.config)),
+    html("details", {}, html("summary", {}, "full configuration"), html("pre", { tabindex: 0 }, run.config)),
   ].filter(Boolean);
 }
 function medium({ name, address }) {
@@ -172,10 +172,10 @@ function medium({ name, address }) {
 const panels = data.tasks.map((task) => new Panel(task));
 const finished = data.runs.filter((run) => run.finished).length;
 const seeds = data.groups.reduce((sum, group) => sum + group.seeds.length, 0);
-const late = data.runs.filter((run) => !run.finished);
+const unfinished = data.runs.filter((run) => !run.finished);
 at("about").textContent = [
-  plural(data.runs.length, "run") + (late.length ? ` (${finished} finished)` : ""),
-  plural(seeds, "seed") + " counted",
+  plural(data.runs.length, "run") + (unfinished.length ? ` (${finished} finished)` : ""),
+  plural(seeds, "seed") + " in the curves",
   plural(data.tasks.length, "task"),
   plural(new Set(data.runs.map((run) => run.agent)).size, "agent"),
   `made ${data.made}`,
@@ -191,11 +191,11 @@ const groupRows = table(at("final"), finalColumns(), data.groups);
 const runRows = table(at("time"), TIME, data.runs);
 const details = data.runs.map((run) => ({ entry: run, element: settings(run) }));
 at("settings").append(...details.map((row) => row.element));
-at("unfinished-section").hidden = !late.length;
-table(at("unfinished"), UNFINISHED, late);
-at("unfinished-note").textContent = late.some((run) => run.group != null)
-  ? "They count in the curves and the table above, as far as they are."
-  : "Left out of the curves and the table above.";
+at("unfinished-section").hidden = !unfinished.length;
+table(at("unfinished"), UNFINISHED, unfinished);
+at("unfinished-note").textContent = unfinished.some((run) => run.group != null)
+  ? "The curves and the table above include them, up to their last evaluation."
+  : "The curves and the table above leave them out.";
 at("damage-section").hidden = !data.damage.length;
 at("damage").append(...data.damage.map((sentence) => html("li", {}, sentence)));
 

@@ -1,1 +1,1 @@
-"""Many trainings: what they are (`plan`, `presets`), who runs them (`local`, `cluster`), and the loop (`run`)."""
+"""Sweeps of many trainings: the list (`plan`, `presets`), where they run (`local`, `cluster`), the loop (`run`)."""

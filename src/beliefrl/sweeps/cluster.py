@@ -1,7 +1,7 @@
-"""Trainings of a sweep on a Ray cluster: wherever it has a core or a GPU to give.
+"""Trainings of a sweep on a Ray cluster, each on a free core or GPU.
 
-The sweep's folder must be one that all its machines see, by the same path. A training whose machine is lost is started
-again by Ray elsewhere, and goes on from its last checkpoint.
+All machines must see the sweep's folder under the same path. If a machine is lost, Ray restarts its trainings on other
+machines, where they continue from their last checkpoints.
 """
 
 import contextlib
@@ -18,14 +18,14 @@ from beliefrl.sweeps.local import environment
 from beliefrl.sweeps.plan import Training
 from beliefrl.types import UserError
 
-RETRIES = 3  # of a training whose machine is lost
+RETRIES = 3  # restarts of a training whose machine is lost
 
 
 class Cluster:
-    """Starts trainings on a Ray cluster, and tells which have ended."""
+    """Starts trainings on a Ray cluster, and collects their exit codes."""
 
     def __init__(self, sweep: pathlib.Path, address: str, workers: int | None = None):
-        """Connect; `address` is HOST:PORT of the head, or auto for one that runs on this machine.
+        """Connect to the head at `address`, HOST:PORT, or "auto" for a head on this machine.
 
         Raises:
             UserError: Ray is not installed, or there is no such cluster.
@@ -36,21 +36,23 @@ class Cluster:
             raise UserError("--ray needs Ray: pip install 'beliefrl[sweep]'.") from None
         self._ray, self.sweep, self._workers = ray, sweep.absolute(), workers
         try:
-            _knock(address)
+            _check_reachable(address)
             ray.init(address=address, log_to_driver=False, configure_logging=False)
         except (ConnectionError, RuntimeError, ValueError, OSError) as error:
-            why = str(error).splitlines()[0].rstrip(".")
-            raise UserError(f"There is no Ray cluster at {address} ({why}): `ray start --head` starts one.") from None
+            reason = str(error).splitlines()[0].rstrip(".")
+            raise UserError(
+                f"There is no Ray cluster at {address} ({reason}): `ray start --head` starts one."
+            ) from None
         self.has_gpus = ray.cluster_resources().get("GPU", 0) >= 1
         kind: dict[str, Any] = {"num_cpus": 1, "num_gpus": 1} if self.has_gpus else {"num_cpus": 1}
-        self._train = ray.remote(**kind, max_retries=RETRIES)(train_there)
+        self._train = ray.remote(**kind, max_retries=RETRIES)(train_on_node)
         self._running: dict[str, Any] = {}
 
     @property
     def room(self) -> int:
-        """How many trainings can be started now: what the cluster has, which may grow."""
-        has = self._ray.cluster_resources().get("GPU" if self.has_gpus else "CPU", 0)
-        return int(min(has, self._workers or has)) - len(self._running)
+        """How many trainings can be started now. It may grow with the cluster."""
+        total = self._ray.cluster_resources().get("GPU" if self.has_gpus else "CPU", 0)
+        return int(min(total, self._workers or total)) - len(self._running)
 
     def start(self, training: Training) -> None:
         log = self.sweep / "logs" / f"{training.name}.log"
@@ -74,7 +76,7 @@ class Cluster:
         return codes
 
     def stop(self) -> None:
-        """Ask every training for a checkpoint, wait until they have ended, and leave the cluster."""
+        """Ask every training to write a checkpoint and stop, wait for them, and disconnect from the cluster."""
         for reference in self._running.values():
             self._ray.cancel(reference, force=False)
         for reference in self._running.values():
@@ -84,15 +86,15 @@ class Cluster:
         self._ray.shutdown()
 
 
-def _knock(address: str) -> None:
-    """Raise an OSError where nobody answers: Ray itself would try for minutes."""
+def _check_reachable(address: str) -> None:
+    """Raise an OSError if nothing listens at `address`. Ray itself would keep trying for minutes."""
     host, _, port = address.rpartition(":")
     if host and port.isdigit():
         socket.create_connection((host, int(port)), timeout=10).close()
 
 
-def train_there(sweep: str, log: str, command: list[str], on_gpu: bool) -> int:
-    """On a machine of the cluster: one training in a process of its own; returns its exit code."""
+def train_on_node(sweep: str, log: str, command: list[str], on_gpu: bool) -> int:
+    """Run one training as a separate process on a machine of the cluster; returns its exit code."""
     if not (pathlib.Path(sweep) / PLAN).exists():
         raise FileNotFoundError(f"{socket.gethostname()} does not see {sweep}: the folder must be on all machines.")
     slot = f"gpu{os.environ.get('CUDA_VISIBLE_DEVICES', '0')}" if on_gpu else "any"
@@ -106,7 +108,7 @@ def train_there(sweep: str, log: str, command: list[str], on_gpu: bool) -> int:
         )
         try:
             while process.poll() is None:
-                time.sleep(0.2)  # not wait(): Ray's cancelling could not interrupt it
+                time.sleep(0.2)  # Ray could not interrupt wait() to cancel the training
         except KeyboardInterrupt:
             process.terminate()
             process.wait()

@@ -1,4 +1,4 @@
-"""Trainings of a sweep on this machine: a process each, on a core or a GPU of its own."""
+"""Trainings of a sweep on this machine: each is a process with its own core or GPU."""
 
 import os
 import pathlib
@@ -10,14 +10,14 @@ from typing import IO
 
 from beliefrl.sweeps.plan import Training
 
-Slot = str  # a core's number, or a GPU's as gpu0, or - for anywhere
+Slot = str  # a core's number, "gpu0" for a GPU, "any" for any one core, or "-" for all cores
 
 
 class Local:
-    """Starts trainings on free cores or GPUs, and tells which have ended."""
+    """Starts trainings on free cores or GPUs, and collects their exit codes."""
 
     def __init__(self, sweep: pathlib.Path, slots: list[Slot]):
-        """`slots` is where trainings can run, one at a time each; `-` is with all the cores."""
+        """`slots` are the places where trainings run, one training at a time in each."""
         self.sweep, self.free = sweep, list(slots)
         self._running: dict[str, tuple[subprocess.Popen[bytes], Slot, IO[bytes]]] = {}
 
@@ -27,7 +27,7 @@ class Local:
         return len(self.free)
 
     def start(self, training: Training) -> None:
-        """Start a training that is not running."""
+        """Start a training in a free slot."""
         slot = self.free.pop(0)
         log = (self.sweep / "logs" / f"{training.name}.log").open("ab")
         core = slot if slot.isdigit() else "-"
@@ -38,7 +38,7 @@ class Local:
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
-            start_new_session=True,  # Ctrl-C goes to the sweep, which passes it on
+            start_new_session=True,  # Ctrl-C goes only to the sweep, which stops its trainings
         )
         self._running[training.name] = (process, slot, log)
 
@@ -52,7 +52,7 @@ class Local:
         return codes
 
     def stop(self) -> None:
-        """Ask every training for a checkpoint, and wait until they have ended."""
+        """Ask every training to write a checkpoint and stop, and wait for them."""
         for process, *_ in self._running.values():
             process.send_signal(signal.SIGTERM)
         for process, *_ in self._running.values():
@@ -61,8 +61,8 @@ class Local:
 
 
 def environment(sweep: pathlib.Path, slot: Slot) -> dict[str, str]:
-    """The environment variables of a training."""
-    cache = sweep / "compiled" / platform.node()  # another machine may not be able to run what this one compiles
+    """The environment variables of a training's process."""
+    cache = sweep / "compiled" / platform.node()  # programs compiled here may not run on another machine
     variables = {
         "JAX_COMPILATION_CACHE_DIR": str(cache.absolute()),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.5",
@@ -71,12 +71,15 @@ def environment(sweep: pathlib.Path, slot: Slot) -> dict[str, str]:
     if slot.startswith("gpu"):
         variables["CUDA_VISIBLE_DEVICES"] = slot.removeprefix("gpu")
     elif slot != "-":
-        variables["NPROC"] = "1"  # threads of XLA, where no core can be chosen
+        variables["NPROC"] = "1"  # one XLA thread, where the process cannot be bound to a core
     return variables
 
 
 def slots(workers: int | None = None) -> list[Slot]:
-    """Where trainings can run on this machine: its GPUs if it has any, or else its cores; `workers` of them at most."""
+    """The slots of this machine: its GPUs if it has any, otherwise its cores.
+
+    With `workers` there are that many slots, except that each GPU has at most one.
+    """
     gpus = _gpus()
     if gpus:
         return [f"gpu{index}" for index in range(min(workers or gpus, gpus))]
@@ -88,7 +91,7 @@ def slots(workers: int | None = None) -> list[Slot]:
 
 
 def _gpus() -> int:
-    """How many GPUs JAX finds. Another process looks, since looking takes most of a GPU's memory."""
-    look = "import jax; print(sum(device.platform == 'gpu' for device in jax.devices()))"
-    found = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True)
+    """The number of GPUs that JAX finds. A separate process counts, since JAX reserves most of a GPU's memory."""
+    count = "import jax; print(sum(device.platform == 'gpu' for device in jax.devices()))"
+    found = subprocess.run([sys.executable, "-c", count], capture_output=True, text=True)
     return int(found.stdout.strip().splitlines()[-1]) if found.returncode == 0 and found.stdout.strip() else 0

@@ -1,11 +1,11 @@
-"""Which trainings a sweep consists of: agents x tasks x settings x seeds, each with a name and a command line.
+"""The list of trainings in a sweep: agents x tasks x settings x seeds, each with a name and a command line.
 
 A sweep's folder:
 
     sweep.json            the trainings
-    NAME/                 a run's folder each (`runs`), NAME as AGENT-TASK-SETTINGS-seedN
-    logs/NAME.log         what each training printed
-    compiled/             programs that XLA has compiled, which the seeds of an experiment share
+    NAME/                 the folder of each run (`runs`); NAME is AGENT-TASK-SETTINGS-seedN
+    logs/NAME.log         the output of each training
+    compiled/             the cache of compiled programs, which the seeds of an experiment share
 """
 
 import dataclasses
@@ -25,23 +25,23 @@ from beliefrl.types import UserError
 
 OPTIONS = tuple(field.name for field in dataclasses.fields(Options))
 SHRINKS = ("step_start_rl", "train_times_fivrm", "pretrain_updates")  # hyperparameters that count steps or updates
-LONGEST_NAME = 120  # of a folder
+LONGEST_NAME = 120  # characters of a folder's name, without the seeds
 
 
 @dataclasses.dataclass(frozen=True)
 class Experiment:
-    """An agent with some settings on a task, with some seeds: a line of a figure."""
+    """An agent with its settings on a task, and the seeds to train: one line of a figure."""
 
     agent: str
-    """Its name."""
+    """The agent's name."""
     task: str
-    """Its name, such as pendulum-v or gym:MountainCarContinuous-v0."""
+    """The task's name, such as pendulum-v or gym:MountainCarContinuous-v0."""
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Hyperparameters of the agent, and options of a training (`beliefrl.Options`) such as steps."""
+    """Hyperparameters of the agent, and training options (`beliefrl.Options`) such as steps."""
     seeds: Sequence[int] = (0, 1, 2, 3, 4)
-    """Numbers of the seeds; the paper has 5 (Appendix B)."""
+    """The seed numbers; the paper uses 5 seeds (Appendix B)."""
     observe: Sequence[int | str] = ()
-    """Entries of the observation that the agent sees, as in `make_task`; none: all."""
+    """Entries of the observation that the agent sees, as in `make_task`; empty: all."""
     constants: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """The task's constants, as in `make_task`."""
 
@@ -54,7 +54,7 @@ class Training:
     agent: str
     task: str
     settings: dict[str, Any]  # hyperparameters
-    options: dict[str, Any]  # with seed and seeds, and steps
+    options: dict[str, Any]  # training options; seed, seeds and steps are always present
     observe: tuple[int | str, ...] = ()
     constants: dict[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -67,7 +67,7 @@ class Training:
         return list(range(self.options["seed"], self.options["seed"] + self.options["seeds"]))
 
     def command(self, sweep: pathlib.Path) -> list[str]:
-        """What follows `beliefrl` on the command line that does this training, or goes on with it."""
+        """The arguments of `beliefrl` that start this training, or continue it."""
         given = [*self.settings.items(), *self.options.items()]
         flags = [part for name, value in given for part in _flag(name, value)]
         seen = ["--observe", *map(str, self.observe)] if self.observe else []
@@ -78,7 +78,7 @@ class Training:
         ]
 
     def is_finished(self, sweep: pathlib.Path) -> bool:
-        """Whether its run has been evaluated at its last step."""
+        """Whether the run has been evaluated at its last step."""
         folder = sweep / self.name
         if not (folder / "results.json").exists():
             return False
@@ -92,14 +92,14 @@ def grid(
     seeds: int | Sequence[int] = 5,
     **fixed: Any,
 ) -> list[Experiment]:
-    """Every agent on every task with every combination of settings.
+    """Experiments: every agent on every task with every combination of settings.
 
         beliefrl.grid(["vrm", "sac-mlp"], ["pendulum-v"], {"lr_critic": [3e-4, 1e-3]}, seeds=3, steps=15_000)
 
     Args:
         agents, tasks: names.
-        settings: for each hyperparameter of the agents, or option of a training, its values.
-        seeds: how many, from 0 on, or their numbers.
+        settings: the values to try, for each hyperparameter or training option.
+        seeds: the number of seeds, counted from 0, or a list of seed numbers.
         fixed: settings with one value.
     """
     names, values = list(settings or {}), list((settings or {}).values())
@@ -113,7 +113,7 @@ def grid(
 
 
 def shrunk(experiment: Experiment, scale: float) -> Experiment:
-    """The same with `scale` times the steps, the exploration, the pre-training and the steps between evaluations."""
+    """A copy with all step counts scaled: training, exploration, pre-training, and the interval of evaluations."""
     hyperparameters, options = _split(experiment.settings)
     agent: Any = _agent(experiment.agent, hyperparameters)
     counts = {name: value for name, value in dataclasses.asdict(agent).items() if name in SHRINKS}
@@ -123,78 +123,81 @@ def shrunk(experiment: Experiment, scale: float) -> Experiment:
 
 
 def plan(experiments: Iterable[Experiment], seeds_per_run: int | None = None) -> list[Training]:
-    """The trainings that experiments consist of, the first seed of every experiment before the second of any.
+    """The trainings of these experiments: the first seed of every experiment, then the second, and so on.
 
     Args:
-        seeds_per_run: how many seeds are trained side by side in one program; None: one, but all that follow each other
-            of an agent that gains from it on a CPU.
+        experiments: what to train.
+        seeds_per_run: most seeds side by side in one program. None: one seed, or all consecutive seeds of an agent that
+            is faster that way on a CPU.
 
     Raises:
         UserError: there is no such agent, task or setting, or a value is impossible.
     """
     planned: dict[str, Training] = {}
-    turns = {}
+    order = {}  # of a training among those of its experiment
     for experiment in experiments:
-        for turn, (first, count) in enumerate(_stretches(experiment, seeds_per_run)):
+        for index, (first, count) in enumerate(_seed_ranges(experiment, seeds_per_run)):
             training = _training(experiment, first, count)
             if planned.setdefault(training.name, training) != training:
-                raise UserError(f"Two trainings would be called {training.name}: only hyperparameters can be varied.")
-            turns[training.name] = turn
+                raise UserError(
+                    f"Two trainings would be called {training.name}: only hyperparameters can have several values."
+                )
+            order[training.name] = index
     _check(planned.values())
-    return sorted(planned.values(), key=lambda training: turns[training.name])
+    return sorted(planned.values(), key=lambda training: order[training.name])
 
 
 def extended(
     before: Sequence[Training], experiments: Iterable[Experiment], seeds_per_run: int | None = None
 ) -> list[Training]:
-    """The trainings of a sweep to which experiments are added; seeds that it has already stay in the runs they are in.
+    """The trainings of a sweep after adding experiments. Seeds that the sweep already has stay in their runs.
 
-    These take over what is new in their options, such as more steps. Arguments and errors are those of `plan`.
+    These runs take over changed options, such as more steps. Arguments and errors are those of `plan`.
     """
-    trainings, fresh = {training.name: training for training in before}, []
+    trainings, added = {training.name: training for training in before}, []
     for experiment in experiments:
-        like, there = _training(experiment, 0, 1), set()
+        like, present = _training(experiment, 0, 1), set()
         for training in [each for each in trainings.values() if _line(each) == _line(like)]:
             if set(training.seeds) & set(experiment.seeds):
                 own = {name: training.options[name] for name in ("seed", "seeds")}
                 trainings[training.name] = dataclasses.replace(training, options=like.options | own)
-                there |= set(training.seeds)
-        fresh.append(dataclasses.replace(experiment, seeds=tuple(set(experiment.seeds) - there)))
+                present |= set(training.seeds)
+        added.append(dataclasses.replace(experiment, seeds=tuple(set(experiment.seeds) - present)))
     _check(trainings.values())
-    return [*trainings.values(), *plan(fresh, seeds_per_run)]
+    return [*trainings.values(), *plan(added, seeds_per_run)]
 
 
 def _line(training: Training) -> tuple[Any, ...]:
-    """What trainings have in common that differ in their seeds only."""
+    """A key that is equal for trainings that differ only in seeds and options."""
     settings = json.dumps([training.settings, training.constants], sort_keys=True, default=str)
     return training.agent, training.task, settings, training.observe
 
 
-# Measured on two cores: two seeds of SAC-MLP in one program take 17 % less time than one after the other, and share
-# one compilation; the recurrent agents gain nothing.
+# Measured on two cores: training two seeds of SAC-MLP in one program takes 17 % less time than one after the other, and
+# needs only one compilation. The recurrent agents gain nothing.
 GAIN_SIDE_BY_SIDE = ("sac-mlp",)
 
 
-def _stretches(experiment: Experiment, seeds_per_run: int | None) -> list[tuple[int, int]]:
-    """The experiment's seeds cut into runs: (first, how many), no more than `seeds_per_run` and without a gap."""
+def _seed_ranges(experiment: Experiment, seeds_per_run: int | None) -> list[tuple[int, int]]:
+    """The experiment's seeds, split into runs of consecutive seeds: (first seed, number of seeds)."""
     compiled = experiment.task.removesuffix("-v").removesuffix("-p") in tasks.TASKS
     gains = compiled and experiment.agent in GAIN_SIDE_BY_SIDE
     most = seeds_per_run or (len(experiment.seeds) if gains else 1)
-    cut: list[tuple[int, int]] = []
+    ranges: list[tuple[int, int]] = []
     for seed in sorted(experiment.seeds):
-        if cut and sum(cut[-1]) == seed and cut[-1][1] < most:
-            cut[-1] = (cut[-1][0], cut[-1][1] + 1)
+        if ranges and sum(ranges[-1]) == seed and ranges[-1][1] < most:
+            ranges[-1] = (ranges[-1][0], ranges[-1][1] + 1)
         else:
-            cut.append((seed, 1))
-    return cut
+            ranges.append((seed, 1))
+    return ranges
 
 
 def _training(experiment: Experiment, first: int, count: int) -> Training:
     settings, options = _split(experiment.settings)
-    told = [f"{name}={_words(value)}" for name, value in {**settings, **dict(experiment.constants)}.items()]
-    seen = [f"observe={_words(experiment.observe)}"] if experiment.observe else []
+    changed = [f"{name}={_as_text(value)}" for name, value in {**settings, **dict(experiment.constants)}.items()]
+    seen = [f"observe={_as_text(experiment.observe)}"] if experiment.observe else []
     seeds = f"seed{first}" + (f"to{first + count - 1}" if count > 1 else "")
-    name = re.sub(r"[^\w.=,-]+", "-", "-".join([experiment.agent, experiment.task, *told, *seen]))
+    name = re.sub(r"[^\w.=,-]+", "-", "-".join([experiment.agent, experiment.task, *changed, *seen]))
     if len(name) > LONGEST_NAME:
         name = f"{name[: LONGEST_NAME - 9]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
     options = {"steps": Options.steps} | options | {"seed": first, "seeds": count}
@@ -209,28 +212,28 @@ def _training(experiment: Experiment, first: int, count: int) -> Training:
     )
 
 
-def _words(value: Any) -> str:
+def _as_text(value: Any) -> str:
     return ",".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
 
 
 def _split(settings: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Hyperparameters, and options of a training."""
+    """The hyperparameters and the training options among `settings`."""
     for name in ("seed", "seeds"):
         if name in settings:
-            raise UserError(f"{name} cannot be a setting of a sweep: give its seeds apart.")
+            raise UserError(f"{name} cannot be a setting of a sweep: use the argument or option for seeds.")
     options = {name: value for name, value in settings.items() if name in OPTIONS}
     return {name: value for name, value in settings.items() if name not in OPTIONS}, options
 
 
 def _check(trainings: Iterable[Training]) -> None:
-    """Find every mistake before anything begins."""
-    made: dict[str, Any] = {}
+    """Raise a UserError for any invalid training, before the first one starts."""
+    specs: dict[str, Any] = {}
     for training in trainings:
         agent = _agent(training.agent, training.settings)
         capacity(agent, Options(**_typed(training.options, Options)))
         key = json.dumps([training.task, training.observe, training.constants], sort_keys=True, default=str)
-        if key not in made:
-            made[key] = tasks.make(training.task, training.observe or None, **training.constants).spec
+        if key not in specs:
+            specs[key] = tasks.make(training.task, training.observe or None, **training.constants).spec
 
 
 def _agent(name: str, hyperparameters: dict[str, Any]) -> Any:
@@ -238,7 +241,7 @@ def _agent(name: str, hyperparameters: dict[str, Any]) -> Any:
 
 
 def _typed(values: dict[str, Any], like: Any) -> dict[str, Any]:
-    """JSON's lists as the tuples they stand for, and whole numbers as floats where `like` has a float."""
+    """Values from JSON with their original types: tuples for lists, floats for integers where `like` has a float."""
 
     def typed(name: str, value: Any) -> Any:
         if isinstance(value, int) and not isinstance(value, bool) and isinstance(getattr(like, name, None), float):

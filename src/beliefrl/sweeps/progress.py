@@ -1,4 +1,4 @@
-"""How far the trainings of a sweep are, read off the ends of their logs, and when the sweep will end."""
+"""The progress of a sweep's trainings, read from the ends of their logs, and an estimate of the time left."""
 
 import pathlib
 import statistics
@@ -12,27 +12,27 @@ from beliefrl.types import UserError
 
 
 class Pace(NamedTuple):
-    """What a training of an agent takes."""
+    """The measured speed of an agent's training."""
 
-    before: float  # seconds until it learns: starting, compiling, pre-training
-    per_step: float  # seconds for an environment step of all its seeds together, once it learns
+    before: float  # seconds before learning begins: start, compilation, exploration, pre-training
+    per_step: float  # seconds per environment step of all its seeds, while it learns
 
 
 class SweepProgress:
-    """What a training has reached that is going on."""
+    """The progress of one running training."""
 
     def __init__(self, folder: pathlib.Path, training: Training):
-        """`folder` is the sweep's."""
+        """`folder` is the folder of the sweep."""
         self.training, self._path = training, folder / training.name
         self.step, self.doing, self.last_return = 0, "starting", None
         self._began, self._learns_since = time.monotonic(), None
 
     def read(self) -> None:
-        """Look again at what is new."""
+        """Read the new rows of the log."""
         try:
             rows = Run(self._path).last_rows(self.training.seeds[0])
         except UserError:
-            return  # its folder is not there yet
+            return  # its folder does not exist yet
         for row in rows:
             if row["kind"] == "pretrain":
                 self.doing = f"pre-training, {row['step']:,} updates"
@@ -47,7 +47,7 @@ class SweepProgress:
 
     @property
     def pace(self) -> Pace | None:
-        """None before it has learned for a while."""
+        """The speed so far; None until learning has advanced."""
         if self._learns_since is None or self.step <= self._learns_since[1]:
             return None
         since, first_step = self._learns_since
@@ -55,15 +55,15 @@ class SweepProgress:
 
 
 class Forecast:
-    """Watches a sweep, and tells when it will end."""
+    """Watches a sweep, and estimates the time left."""
 
     def __init__(self, folder: pathlib.Path):
         self.folder = folder
         self.going: dict[str, SweepProgress] = {}
-        self._seen: dict[str, Pace] = {}  # of each agent, the latest
+        self._seen: dict[str, Pace] = {}  # the latest pace of each agent
 
     def watch(self, status: SweepStatus) -> None:
-        """Look at every training that is going on."""
+        """Read the progress of every running training."""
         for name in self.going.keys() - status.running.keys():
             del self.going[name]
         for name, training in status.running.items():
@@ -73,7 +73,7 @@ class Forecast:
                 self._seen[training.agent] = progress.pace
 
     def seconds_left(self, status: SweepStatus) -> float | None:
-        """Until all of the sweep is done, at the pace seen so far; None before there was any."""
+        """Seconds until the sweep is finished, at the pace so far; None before a pace is known."""
         if not self._seen:
             return None
         usual = Pace(*map(statistics.fmean, zip(*self._seen.values(), strict=True)))
@@ -82,6 +82,6 @@ class Forecast:
             pace = self._seen.get(training.agent, usual)
             return max(training.steps - done, 0) * pace.per_step + (0.0 if learns else pace.before)
 
-        going = [seconds(each.training, each.step, each.doing == "learning") for each in self.going.values()]
+        running = [seconds(each.training, each.step, each.doing == "learning") for each in self.going.values()]
         waiting = sum(seconds(training, 0, False) for training in status.waiting)
-        return max((waiting + sum(going)) / max(len(going), 1), *going, 0.0)
+        return max((waiting + sum(running)) / max(len(running), 1), *running, 0.0)

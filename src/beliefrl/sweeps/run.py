@@ -1,4 +1,4 @@
-"""The loop of a sweep: start what is waiting where there is room, note what has ended, go on after a stop."""
+"""The loop of a sweep: start waiting trainings, collect finished ones, and continue after a stop."""
 
 import dataclasses
 import os
@@ -16,7 +16,7 @@ from beliefrl.training.stop import Requests, Stopped
 from beliefrl.types import UserError, one_line
 
 LOOK_EVERY = 0.5  # seconds
-ALL = 10_000  # more seeds than an experiment has
+ALL = 10_000  # seeds in one run, more than any experiment has
 
 
 @runtime_checkable
@@ -32,12 +32,12 @@ class Launcher(Protocol):
 
 @dataclasses.dataclass
 class SweepStatus:
-    """How far a sweep is."""
+    """The state of a sweep: each training is finished, waiting, running or failed."""
 
     finished: list[Training]
     waiting: list[Training]
     running: dict[str, Training] = dataclasses.field(default_factory=dict)
-    failed: dict[str, str] = dataclasses.field(default_factory=dict)  # why, in its own words
+    failed: dict[str, str] = dataclasses.field(default_factory=dict)  # name: the last error message of the training
 
     @property
     def count(self) -> int:
@@ -55,24 +55,24 @@ def sweep(
     ray: str | None = None,
     report: Report | None = None,
 ) -> SweepStatus:
-    """Train what experiments consist of, as many at a time as there is room for; those that fail are noted.
+    """Run all trainings of some experiments, several at a time. If one fails, the others continue.
 
     Args:
-        experiments: `beliefrl.grid(...)`, or a list of `beliefrl.Experiment`. Empty: what `out` has goes on.
-        out: the sweep's folder. What is finished in it is not done again, what was stopped goes on.
-        workers: most trainings at a time, on a core each; None: as many as there are cores, or GPUs. 0: one at a time,
-            with all the cores.
-        seeds_per_run: seeds side by side in one program; None: what pays, which is all on a GPU.
-        ray: where the head of a Ray cluster is (HOST:PORT, or auto), if it shall run there.
-        report: called twice a second with how far it is.
+        experiments: `beliefrl.grid(...)`, or a list of `beliefrl.Experiment`. Empty: continue the sweep in `out`.
+        out: the sweep's folder. Finished trainings in it are not repeated, stopped ones continue.
+        workers: most trainings at a time, one per core or GPU. None: as many as there are cores or GPUs. 0: one at a
+            time, with all cores.
+        seeds_per_run: most seeds side by side in one program. None: all on a GPU, the fastest number on a CPU.
+        ray: address of the head of a Ray cluster (HOST:PORT, or "auto"). None: run on this machine.
+        report: called twice a second with the state of the sweep.
 
     Raises:
-        UserError: a name, setting or value that is impossible, before anything begins; another process runs this sweep;
-            or a training has failed, when all the others have ended.
-        Stopped: Ctrl-C or SIGTERM, once every training has written a checkpoint. It is a KeyboardInterrupt.
+        UserError: a name, setting or value is impossible (raised before any training starts); another process runs this
+            sweep; or a training has failed (raised after all others have ended).
+        Stopped: Ctrl-C or SIGTERM, after every training has written a checkpoint. It is a KeyboardInterrupt.
     """
     folder = pathlib.Path(out)
-    plans.plan(experiments)  # complain before there is a folder
+    plans.plan(experiments)  # raise errors before a folder is made
     with _lock(folder):
         before = files.read(folder)
         _check_named(folder, before, experiments)
@@ -87,10 +87,10 @@ def sweep(
             finally:
                 launcher.stop()
     if status.failed:
-        name, why = next(iter(status.failed.items()))
+        name, error = next(iter(status.failed.items()))
         raise UserError(
-            f"{len(status.failed)} of {status.count} trainings failed, such as {name} ({why.rstrip('.')}): mend that "
-            f"and give the command again; {folder}/logs has what each said."
+            f"{len(status.failed)} of {status.count} trainings failed, such as {name} ({error.rstrip('.')}): fix the "
+            f"cause and run the command again; {folder}/logs has the output of each."
         )
     return status
 
@@ -105,7 +105,7 @@ def _check_named(folder: pathlib.Path, before: Sequence[Training], experiments: 
 
 
 def _status(folder: pathlib.Path, trainings: Sequence[Training]) -> SweepStatus:
-    """Where a sweep stands that consists of these."""
+    """The state of a sweep with these trainings, which are written to its folder."""
     files.write(folder, trainings)
     finished = [training for training in trainings if training.is_finished(folder)]
     return SweepStatus(finished, [training for training in trainings if training not in finished])
@@ -126,16 +126,18 @@ def _loop(folder: pathlib.Path, status: SweepStatus, launcher: Launcher, report:
         report(status)
         if requests.number:
             launcher.stop()
-            told = f"stopped with {len(status.finished)} of {status.count} trainings finished"
-            raise Stopped(f"{told}; `beliefrl sweep --out {folder}` goes on from there.", requests.number)
+            done = f"{len(status.finished)} of {status.count}"
+            raise Stopped(
+                f"stopped with {done} trainings finished; `beliefrl sweep --out {folder}` continues.", requests.number
+            )
         time.sleep(LOOK_EVERY)
 
 
 def reason(log: pathlib.Path, code: int) -> str:
-    """Why a training ended badly: the last thing it said."""
+    """Why a training failed: its last error message, or else the last line of its output."""
     lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
-    said = [line.removeprefix("beliefrl: ") for line in lines if line.startswith("beliefrl: ")] or lines
-    return said[-1] if said else f"it ended with code {code} and said nothing"
+    messages = [line.removeprefix("beliefrl: ") for line in lines if line.startswith("beliefrl: ")] or lines
+    return messages[-1] if messages else f"it ended with code {code} and printed nothing"
 
 
 def _lock(folder: pathlib.Path) -> Any:

@@ -1,4 +1,4 @@
-"""Tasks: what an agent is placed in. A new task is one file and one line in `TASKS`."""
+"""Tasks: the environments that agents act in. A new task needs one file and one line in `TASKS`."""
 
 import dataclasses
 import difflib
@@ -19,11 +19,12 @@ from beliefrl.types import Spec, UserError, check_indices, said, tuples
 
 @runtime_checkable
 class Task(Protocol):
-    """A frozen dataclass of physical constants with pure methods; no time limit and no reset of its own.
+    """A frozen dataclass of physical constants with pure methods. It does not reset itself, nor apply its time limit.
 
-    `rollout` cuts episodes at `spec.max_steps` and resets them. A task that can be seen also has `draw(states)`, the
-    `drawing.Picture` of an episode's states so far. A task may have `entry_names`, a tuple with the name of each entry
-    of its observation and the unit in brackets, as figures show them: ("cos θ", "sin θ", "θ̇ (rad/s)").
+    `rollout` truncates episodes at `spec.max_steps` and resets them. Two members are optional. A task that can be
+    rendered has a method `draw(states)`, which returns the `drawing.Picture` of an episode's states so far. A task may
+    have `entry_names`, a tuple with the name of each entry of its observation, followed by the unit in brackets, for
+    the labels in figures: ("cos θ", "sin θ", "θ̇ (rad/s)").
     """
 
     @property
@@ -32,23 +33,23 @@ class Task(Protocol):
         ...
 
     def reset(self, key: Key[Array, ""]) -> tuple[Any, Float[Array, " obs"]]:
-        """Draw a first state; returns it and its observation."""
+        """Draw an initial state; returns it and its observation."""
         ...
 
     def step(
         self, state: Any, action: Float[Array, " action"], key: Key[Array, ""]
     ) -> tuple[Any, Float[Array, " obs"], Float[Array, ""], Bool[Array, ""]]:
-        """Do an action in [-1, 1]; returns the next state, its observation, the reward, and whether it is terminal."""
+        """Apply an action in [-1, 1]; returns the next state, its observation, the reward, and terminated."""
         ...
 
     def success(self, state: Any) -> Bool[Array, ""]:
-        """Whether the episode has reached its aim; False for ever where `spec.has_success` is False."""
+        """Whether the episode has succeeded; always False if `spec.has_success` is False."""
         ...
 
 
 @dataclasses.dataclass(frozen=True)
 class Observed:
-    """A task of which only some entries of the observation are seen (Appendix B: velocities only, no velocities)."""
+    """A task with only some entries of its observation (Appendix B: velocities only, no velocities)."""
 
     task: Any
     indices: tuple[int, ...]
@@ -75,10 +76,10 @@ class Observed:
 
 
 def observe(task: Any, indices: tuple[int, ...]) -> Any:
-    """The same task of which only the entries `indices` of the observation are seen.
+    """The same task with only the entries `indices` of its observation.
 
     Raises:
-        UserError: an index outside the observation, the same one twice, or none at all.
+        UserError: an index is outside the observation or occurs twice, or there is no index.
     """
     size = task.spec.obs_dim
     check_indices(indices, size)
@@ -89,7 +90,7 @@ def observe(task: Any, indices: tuple[int, ...]) -> Any:
 
 
 def entries(task: Any) -> tuple[int, ...]:
-    """Which entries of the task's full observation the agent sees, in its order; the numbers that `observe` takes."""
+    """Indices of the entries that the agent sees in the task's full observation, in the agent's order."""
     if isinstance(task, Observed):
         inner = entries(task.task)
         return tuple(inner[i] for i in task.indices)
@@ -98,10 +99,10 @@ def entries(task: Any) -> tuple[int, ...]:
 
 
 def entry_names(task: Any) -> tuple[str, ...]:
-    """What figures call each entry that the agent sees: the task's own name, or "entry 2" of its full observation.
+    """The label of each entry that the agent sees: the task's name for it, or its index, "entry 2".
 
     Raises:
-        UserError: the task has more or fewer names than entries.
+        UserError: the number of names differs from the number of entries.
     """
     if isinstance(task, Observed):
         inner = entry_names(task.task)
@@ -125,13 +126,13 @@ MASKS = {"-v": "velocities", "-p": "positions"}
 
 
 def names() -> dict[str, str]:
-    """Every task's name with a sentence on it: ours, then those of installed packages, which are not imported."""
+    """The name and a description of every task: ours, then those of installed packages, which are not imported."""
     ours = our_names()
     return ours | {name: f"{value}, of an installed package." for name, value in declared(GROUP, ours).items()}
 
 
 def our_names() -> dict[str, str]:
-    """The names of the tasks of this library, in the order of the paper's table (Appendix B)."""
+    """The name and a description of this library's tasks, in the order of the paper's table (Appendix B)."""
     listed = {}
     for name, task in TASKS.items():
         listed |= _masked(name, (task.__doc__ or "").split("\n")[0], task)
@@ -165,40 +166,40 @@ def _declared_class(name: str, value: str) -> type:
 
 
 def _masked(name: str, about: str, task: Any) -> dict[str, str]:
-    """The task and its versions with a part of the observation."""
+    """The description of a task, and of its versions with part of the observation."""
     velocities, positions = masks(task)
     listed = {name: about}
     if velocities:
-        listed[f"{name}-v"] = f"{name}, velocities only: entries {_spaced(velocities)} of its observation"
-        listed[f"{name}-p"] = f"{name}, no velocities: entries {_spaced(positions)} of its observation"
+        listed[f"{name}-v"] = f"{name}, velocities only: entries {_listed(velocities)} of its observation"
+        listed[f"{name}-p"] = f"{name}, no velocities: entries {_listed(positions)} of its observation"
     return listed
 
 
 def masks(task: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Which entries of the observation are velocities, and which are not; nothing of a task that does not say."""
+    """The indices of the velocities and of all other entries; empty if the task does not define them."""
     if isinstance(task, registered.Known):
         return task.velocities, task.positions
     return tuple(getattr(task, "VELOCITIES", ())), tuple(getattr(task, "POSITIONS", ()))
 
 
-def _spaced(indices: tuple[int, ...]) -> str:
+def _listed(indices: tuple[int, ...]) -> str:
     return ", ".join(map(str, indices))
 
 
 def make(name: str, /, observe: Sequence[int | str] | int | str | None = None, **constants: Any) -> Any:
-    """The task of that name.
+    """Make the task with a name.
 
-    "pendulum-v" is pendulum with velocities only, "pendulum-p" (positions) without velocities. "gym:ID" is any
-    Gymnasium environment, "gym:PACKAGE:ID" one that a package registers.
+    "pendulum-v" is the pendulum with velocities only, "pendulum-p" (positions) the one without velocities. "gym:ID" is
+    any Gymnasium environment, "gym:PACKAGE:ID" one that a package registers.
 
     Args:
-        name: of the task.
-        observe: indices of the observation that the agent sees, in that order, or "velocities" or "positions" where the
-            task says which they are; None is all.
-        constants: replace the task's physical constants, or are gymnasium.make's arguments.
+        name: name of the task.
+        observe: indices of the entries that the agent sees, in that order. "velocities" or "positions" if the task
+            defines them. None: all entries.
+        constants: physical constants of the task to change, or arguments of gymnasium.make.
 
     Raises:
-        UserError: no task has that name, it has no such constant, a value is impossible, or `observe` does not fit it.
+        UserError: there is no such task or constant, a value is impossible, or `observe` does not fit the task.
     """
     task = _make(name, constants)
     return task if observe is None else _observed(task, _indices(name, task, observe))
@@ -246,24 +247,23 @@ def _built(name: str, kind: type, constants: dict[str, Any]) -> Any:
 
 
 def _similar(name: str) -> str | None:
-    """The task whose name is most like this one, which may be a Gymnasium id without its prefix."""
+    """The task with the most similar name; `name` may be a Gymnasium id without its prefix."""
     near = difflib.get_close_matches(name, names(), n=1)
     return near[0] if near and name not in registered.ids() else registered.similar(name)
 
 
 def _observed(task: Any, indices: tuple[int, ...]) -> Any:
-    return observe(task, indices)  # in `make` this word is an argument
+    return observe(task, indices)  # in `make`, `observe` is an argument
 
 
 def _indices(name: str, task: Any, observe: Sequence[int | str] | int | str) -> tuple[int, ...]:
-    """What `observe` means for a task, which has that name."""
+    """The indices that `observe` means for a task."""
     given = [observe] if isinstance(observe, str | int) else list(observe)
     if len(given) == 1 and given[0] in MASKS.values():
-        of: Any = registered.KNOWN.get(name.removeprefix(registered.PREFIX), registered.ROBOTS.get(name))
-        of = of or TASKS.get(name) or task
-        velocities, positions = masks(of)
+        known: Any = registered.KNOWN.get(name.removeprefix(registered.PREFIX), registered.ROBOTS.get(name))
+        velocities, positions = masks(known or TASKS.get(name) or task)
         if not velocities:
-            raise UserError(f"{name} does not say which of its observations are {given[0]}: give their indices.")
+            raise UserError(f"{name} does not define which entries are {given[0]}: give their indices.")
         return velocities if given[0] == "velocities" else positions
     try:
         return tuple(int(str(entry)) for entry in given)  # int(1.5) is 1
@@ -274,9 +274,10 @@ def _indices(name: str, task: Any, observe: Sequence[int | str] | int | str) -> 
 
 
 def describe(task: Any) -> dict[str, Any]:
-    """{"task": the name for `make`, "constants": what it was made with, "observe": the indices, if given apart}.
+    """{"task": name, "constants": constants, "observe": indices}, the arguments of `make` for a task.
 
-    A task that `make` cannot make is named module:Class, and has no constants. Nothing is imported.
+    "observe" is None if the name implies the indices. A task that `make` cannot make has the name module:Class and no
+    constants. Nothing is imported.
     """
     if isinstance(task, GymnasiumTask):
         return _describe_gymnasium(task)

@@ -2,7 +2,7 @@
 
 temp = (F + m_p l θ̇² sin θ) / m,   F = 30 a,   m = m_c + m_p
 θ̈ = (g sin θ - cos θ temp) / (l (4/3 - m_p cos² θ / m))
-ẍ = temp - m_p l θ̈ cos θ / m,   all four integrated by Euler's explicit step
+ẍ = temp - m_p l θ̈ cos θ / m,   integrated with explicit Euler steps
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Key
 from beliefrl.tasks.drawing import BLUE, GREY, INK, PALE, RED, Circle, Line, Picture, Polygon
 from beliefrl.types import Spec, check_range
 
-START = 0.05  # an episode begins with all four numbers in [-START, START]
+START = 0.05  # all four entries of the initial state are in [-START, START]
 
 
 class CartPoleState(NamedTuple):
@@ -42,11 +42,11 @@ class CartPole:
     force: float = 30.0
     """N, at action 1."""
     dt: float = 0.02
-    """s, the length of a step."""
+    """s, duration of a step."""
     max_x: float = 2.4
-    """m, beyond which the episode terminates."""
+    """m, distance from the middle at which the episode terminates."""
     max_theta: float = math.radians(12.0)
-    """rad, beyond which the episode terminates."""
+    """rad, angle at which the episode terminates."""
     max_steps: int = 1000
     """Time limit in steps."""
 
@@ -55,7 +55,7 @@ class CartPole:
     POSITIONS: ClassVar[tuple[int, ...]] = (0, 2)
 
     def __post_init__(self) -> None:
-        """Refuse impossible values with a UserError."""
+        """Raise a UserError for impossible values."""
         check_range(self, ("cart_mass", "pole_mass", "half_length", "force"), 0.001, 1000)
         check_range(self, ("gravity",), 0, 1000)
         check_range(self, ("dt",), 0.0001, 1)
@@ -93,7 +93,7 @@ class CartPole:
         return jnp.array(False)
 
     def draw(self, states: Sequence[CartPoleState]) -> Picture:
-        """The cart on its track, whose ends it must not pass, and the pole in the angle it must not leave."""
+        """The cart on its track, the ends of the track, the pole, and its permitted range of angles."""
         x, theta = float(states[-1].x), float(states[-1].theta)
         size = 2 * self.half_length
         hinge = (x, 0.0)

@@ -1,4 +1,4 @@
-"""Pictures of tasks: flat shapes in world coordinates, painted with Pillow. No display is needed."""
+"""Pictures of tasks: flat shapes in world coordinates, drawn with Pillow. No display is needed."""
 
 import itertools
 import math
@@ -11,9 +11,9 @@ from PIL import Image, ImageDraw
 
 from beliefrl.types import UserError
 
-Point = Any  # x to the right and y upwards: two numbers in a tuple or an array
-Points = Any  # a sequence of them, or an array (points, 2)
-SMOOTH = 3  # painted so many times larger and averaged: Pillow's own edges are jagged
+Point = Any  # (x, y) as a tuple or an array; x points right, y points up
+Points = Any  # a sequence of points, or an array (points, 2)
+SMOOTH = 3  # supersampling factor, as Pillow does not smooth edges
 
 PAPER, PALE, GREY, INK = "#fbfaf7", "#e4e1d8", "#a9a79e", "#2f3a45"
 RED, GREEN, BLUE = "#c8553d", "#4b9460", "#2a6f9e"
@@ -26,7 +26,7 @@ class Circle(NamedTuple):
 
 
 class Line(NamedTuple):
-    """A line through one or more points, round at its ends and bends."""
+    """A line through one or more points, with round ends and corners."""
 
     points: Points
     width: float
@@ -39,16 +39,16 @@ class Polygon(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """Shapes in the units of the world, the first one undermost; colours as Pillow knows them, such as "#c8553d"."""
+    """Shapes in world units, drawn in this order. Colours are those of Pillow, such as "#c8553d"."""
 
-    low: Point  # the world's corner at the picture's lower left
-    high: Point  # at its upper right
+    low: Point  # world coordinates of the lower left corner
+    high: Point  # world coordinates of the upper right corner
     shapes: Sequence[Circle | Line | Polygon]
-    pixels: int = 480  # of the longer side
+    pixels: int = 480  # length of the longer side
 
 
 def paint(picture: Picture) -> UInt8[np.ndarray, "height width 3"]:
-    """The picture as pixels in 0 to 255, the uppermost row first; both sides are even, as video encoders want them."""
+    """The picture as pixels from 0 to 255, top row first. Width and height are even, as video encoders require."""
     low, high = np.asarray(picture.low, float), np.asarray(picture.high, float)
     scale = picture.pixels / np.max(high - low)
     width, height = 2 * np.ceil((high - low) * scale / 2 - 1e-6).astype(int)
@@ -63,7 +63,7 @@ def paint(picture: Picture) -> UInt8[np.ndarray, "height width 3"]:
         canvas.ellipse((x - radius, y - radius, x + radius, y + radius), colour)
 
     def bar(points: list[tuple[float, float]], radius: float, colour: str) -> None:
-        # Pillow's own thick lines are a pixel narrower than they should be, and have flat ends.
+        # Pillow's own thick lines are one pixel too narrow, and have flat ends.
         for (x0, y0), (x1, y1) in itertools.pairwise(points):
             length = math.hypot(x1 - x0, y1 - y0) or 1.0
             dx, dy = radius * (y1 - y0) / length, radius * (x0 - x1) / length
@@ -83,10 +83,10 @@ def paint(picture: Picture) -> UInt8[np.ndarray, "height width 3"]:
 
 
 class Viewer:
-    """A window that shows pictures, one after another; there can be one at a time."""
+    """A window that shows one picture after another. Only one window can be open at a time."""
 
     def __init__(self, title: str):
-        """Opens with the first picture.
+        """Prepare a window, which opens with the first picture.
 
         Raises:
             UserError: pygame is not installed.
@@ -98,14 +98,14 @@ class Viewer:
         self._pygame, self._title, self._clock = pygame, title, pygame.time.Clock()
 
     def show(self, pixels: UInt8[np.ndarray, "height width 3"], fps: int) -> None:
-        """Show a picture, not before 1 / fps seconds have passed since the last one."""
+        """Show a picture, at least 1 / fps seconds after the previous one."""
         height, width, _ = pixels.shape
         screen = self._pygame.display.get_surface()
         if screen is None:
             self._pygame.display.init()
             screen = self._pygame.display.set_mode((width, height))
             self._pygame.display.set_caption(self._title)
-        self._pygame.event.pump()  # else the system takes the window for one that hangs
+        self._pygame.event.pump()  # otherwise the system considers the window unresponsive
         screen.blit(self._pygame.image.frombuffer(pixels.tobytes(), (width, height), "RGB"), (0, 0))
         self._pygame.display.flip()
         self._clock.tick(fps)

@@ -1,11 +1,11 @@
-"""Our tasks for others: every JAX task as a Gymnasium environment.
+"""Gymnasium environments of the JAX tasks, for use with other libraries.
 
     import beliefrl, gymnasium
 
     env = gymnasium.make("BeliefRL/PendulumV-v0", render_mode="rgb_array", mass=2.0)
 
-Stepping one task on a GPU is slower than on the CPU, and JAX would reserve most of the GPU's memory: where another
-library learns on the GPU, set the environment variable JAX_PLATFORMS=cpu.
+Stepping a single task is slower on a GPU than on a CPU, and JAX reserves most of the GPU's memory. If another library
+learns on the GPU, set the environment variable JAX_PLATFORMS=cpu.
 """
 
 import functools
@@ -22,7 +22,7 @@ from beliefrl.tasks import Observed, Task
 from beliefrl.tasks.drawing import Picture, Viewer, paint
 from beliefrl.types import LARGEST, UserError
 
-# The task is static, so environments of equal tasks share what was compiled for the first of them.
+# The task is a static argument, so environments of equal tasks share one compiled program.
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -35,9 +35,9 @@ def _reset(task: Task, seed: Any) -> tuple[Key[Array, ""], Any, Float[Array, " o
 def _step(
     task: Task, key: Key[Array, ""], state: Any, action: Float[Array, " action"]
 ) -> tuple[Key[Array, ""], Any, Float[Array, " obs"], Float[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
-    """The next key and state; then observation, reward, whether that is terminal, and whether it is a success."""
+    """The next key and state, then the observation, reward, terminated and success."""
     key, now = jax.random.split(key)
-    # Others' Gaussian policies overshoot, and a Task is promised actions in [-1, 1].
+    # Gaussian policies of other libraries may exceed [-1, 1], but a Task expects actions in this range.
     state, obs, reward, terminated = task.step(state, jnp.clip(action, -1.0, 1.0), now)
     return key, state, obs, reward, terminated, task.success(state)
 
@@ -45,38 +45,39 @@ def _step(
 class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
     """A task as a Gymnasium environment.
 
-    Observations are (obs_dim,) float32, as the task gives them; actions (action_dim,) in [-1, 1], clipped to it.
-    `info["is_success"]` tells after each step whether the episode has reached its aim, where `spec.has_success`.
+    Observations are (obs_dim,) float32. Actions (action_dim,) are clipped to [-1, 1]. If `spec.has_success`,
+    `info["is_success"]` says after each step whether the episode has succeeded.
 
-    The time limit is Gymnasium's: `gymnasium.make` sets it to the task's `max_steps`, or to `max_episode_steps`.
-    For a task of your own: `gymnasium.wrappers.TimeLimit(TaskEnvironment(task), task.spec.max_steps)`.
+    The environment has no time limit. `gymnasium.make` adds one: the task's `max_steps`, or the argument
+    `max_episode_steps`. For a task of your own, use
+    `gymnasium.wrappers.TimeLimit(TaskEnvironment(task), task.spec.max_steps)`.
 
-    To be rendered, a task has a method `draw(states) -> drawing.Picture`, given the episode's states, the newest last.
+    To be rendered, a task needs a method `draw(states) -> drawing.Picture`. `states` are the episode's states, the
+    newest last.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 10}
 
     def __init__(self, task: str | Task, render_mode: str | None = None, **constants: Any):
-        """Of a task's name or of a task of your own.
+        """Make the environment of a task.
 
         Args:
-            task: one of `tasks.names()`, or any `Task` that is hashable, as frozen dataclasses are.
-            render_mode: "rgb_array" for `render` to return pictures, "human" for a window, None for neither.
-            constants: replace the physical constants of the task of that name, as in `tasks.make`.
+            task: the name of a JAX task, or any hashable `Task`, such as a frozen dataclass.
+            render_mode: "rgb_array": `render` returns pictures; "human": a window shows them; None: no pictures.
+            constants: physical constants to change, if `task` is a name (`tasks.make`).
 
         Raises:
-            UserError: no task has that name, it has no such constant, it is not a task in JAX or not hashable, or
-                there is no such render mode.
+            UserError: there is no such task, constant or render mode, or the task is not a JAX task or not hashable.
         """
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise UserError(f"render_mode={render_mode!r} is impossible: it must be rgb_array, human or None.")
         if "max_steps" in constants:
-            raise UserError("max_steps is Gymnasium's to set: give gymnasium.make max_episode_steps instead.")
+            raise UserError("max_steps cannot be given here: use the argument max_episode_steps of gymnasium.make.")
         if constants and not isinstance(task, str):
-            raise UserError(f"A task that is made already takes no constants: make it with {', '.join(constants)}.")
+            raise UserError(f"An existing task takes no constants: make the task itself with {', '.join(constants)}.")
         self.task = tasks.make(task, **constants) if isinstance(task, str) else task
         if not isinstance(self.task, Task):
-            raise UserError(f"{task} is not written in JAX: use gymnasium.make for it, or give a task in JAX.")
+            raise UserError(f"{task} is not a JAX task: use gymnasium.make for it, or give a JAX task.")
         try:
             hash(self.task)
         except TypeError:
@@ -85,7 +86,7 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         spec = self.task.spec
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (spec.action_dim,), np.float32)
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (spec.obs_dim,), np.float32)
-        # What is hidden from the agent is drawn all the same.
+        # Pictures also show what is hidden from the agent.
         self._drawn: Any = self.task
         while isinstance(self._drawn, Observed):
             self._drawn = self._drawn.task
@@ -96,10 +97,10 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
 
     @property
     def states(self) -> list[Any]:
-        """The task's states in this episode, the newest last; only that one where nothing is rendered.
+        """The task's states in this episode, the newest last. Without a render mode there is only the newest.
 
         Raises:
-            UserError: there are none before the first reset.
+            UserError: `reset` has not been called.
         """
         if not self._states:
             raise UserError("The environment has no state yet: call reset first.")
@@ -108,9 +109,9 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin an episode; returns its first observation (obs,) and no info. `options` are of no account.
+        """Start an episode; returns its first observation (obs,) and an empty info. `options` are ignored.
 
-        The same seed gives the same episodes, from here on.
+        The same seed gives the same sequence of episodes.
         """
         super().reset(seed=seed)
         self._key, state, obs = _reset(self.task, self.np_random.integers(LARGEST))
@@ -119,10 +120,10 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         return np.array(obs), {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Do an action (action,); returns observation (obs,), reward, terminated, truncated (never here), info.
+        """Apply an action (action,); returns observation (obs,), reward, terminated, truncated (always False), info.
 
         Raises:
-            UserError: an action of another shape, or a step before the first reset.
+            UserError: the action has the wrong shape, or `reset` has not been called.
         """
         action = np.asarray(action, np.float32)
         if action.shape != self.action_space.shape:
@@ -142,10 +143,10 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._drawn.draw(self.states)
 
     def render(self) -> UInt8[np.ndarray, "height width 3"] | None:
-        """The picture of this moment where `render_mode` is "rgb_array"; the window of "human" shows it by itself.
+        """The current picture if `render_mode` is "rgb_array". With "human" the window is updated without this call.
 
         Raises:
-            UserError: the task has no method `draw`, or there is no state before the first reset.
+            UserError: the task has no method `draw`, or `reset` has not been called.
         """
         return paint(self._picture()) if self.render_mode == "rgb_array" else None
 
@@ -162,7 +163,7 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
 
 
 def ids() -> dict[str, str]:
-    """Gymnasium's id for each task that this library brings, with the task's name; "pendulum-v" is PendulumV-v0."""
+    """{Gymnasium id: task name} of all tasks of this library, such as {"BeliefRL/PendulumV-v0": "pendulum-v"}."""
     return {
         f"BeliefRL/{task.__name__}{mask[1:].upper()}-v0": name + mask
         for name, task in tasks.TASKS.items()
@@ -171,7 +172,7 @@ def ids() -> dict[str, str]:
 
 
 def register() -> None:
-    """Make all tasks of this library known to `gymnasium.make`; once is enough, more do no harm."""
+    """Register all tasks of this library in Gymnasium. Repeated calls have no effect."""
     for identifier, name in ids().items():
         if identifier not in gymnasium.registry:
             gymnasium.register(

@@ -1,7 +1,7 @@
-"""Any Gymnasium environment as a task: observations flat and masked, actions in [-1, 1], faults put as sentences.
+"""Any Gymnasium environment as a task: flat and masked observations, actions in [-1, 1], and clear messages for faults.
 
-Such a task runs on the host, not in a compiled program (`host_loop`). It is what it says to the agent: a `spec`, and
-environments in which an episode is what `rollout` means by one. All checks of what an environment returns are here.
+Such a task runs on the host, not in a compiled program (`host_loop`). It has a `spec`, and makes environments whose
+episodes follow the same rules as those of `rollout`. This module checks everything that an environment returns.
 """
 
 import dataclasses
@@ -16,11 +16,11 @@ from gymnasium import spaces
 from beliefrl.tasks.spaces import check_actions, flat_bounds, flat_size, limits
 from beliefrl.types import LARGEST, Spec, UserError, check_indices, check_range, said, short
 
-ENDLESS = 10_000  # steps after which an episode without a time limit is taken for one that never ends
+ENDLESS = 10_000  # steps after which an episode without a time limit is considered endless
 
 
 class Fault(UserError):
-    """An environment did what none may do. Names the environment, the seed and the step."""
+    """An environment misbehaved. The message names the environment, the seed and the step."""
 
     seeds: Any = None  # of a training: what was learned until then (`host_loop`)
     step: int = 0
@@ -34,18 +34,18 @@ class GymnasiumTask:
     make: Callable[..., gymnasium.Env[Any, Any]]
     """Makes one environment; called with `arguments`."""
     name: str = ""
-    """What messages and runs call it; empty is the name of `make`."""
+    """Name in messages and runs; empty: the name of `make`."""
     arguments: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Keyword arguments for `make`."""
     indices: tuple[int, ...] | None = None
-    """Entries of the flat observation that the agent sees; None is all."""
+    """Entries of the flat observation that the agent sees; None: all."""
     max_steps: int | None = None
-    """Time limit in steps, which truncates; None is the environment's own."""
+    """Time limit in steps, which truncates episodes; None: the environment's own limit."""
     has_success: bool = False
-    """Whether its info says `is_success` or `success`, so that rates of it are logged."""
+    """Whether the environment's info has `is_success` or `success`; the success rate is then logged."""
 
     def __post_init__(self) -> None:
-        """Name it, and refuse an impossible time limit with a UserError."""
+        """Set the default name. Raise a UserError for an impossible time limit."""
         if self.max_steps is not None:
             check_range(self, ("max_steps",), 1)
         if not self.name:
@@ -53,10 +53,10 @@ class GymnasiumTask:
 
     @cached_property
     def spec(self) -> Spec:
-        """Sizes of what the agent sees and does, and the time limit.
+        """Sizes of the observation and the action, and the time limit in steps.
 
         Raises:
-            UserError: it cannot be made, or its spaces are not supported.
+            UserError: the environment cannot be made, or its spaces are not supported.
         """
         environment = self.environment()
         environment.close()
@@ -64,10 +64,10 @@ class GymnasiumTask:
         return Spec(environment.indices.size, actions.low.size, environment.limit or LARGEST, self.has_success)
 
     def environment(self, seed: str = "") -> "Environment":
-        """One of its environments as the agent sees it; `seed` is what faults say of whose it is.
+        """Make one environment, as the agent sees it. `seed` identifies it in the messages of faults.
 
         Raises:
-            UserError: it cannot be made, or its spaces are not supported.
+            UserError: the environment cannot be made, or its spaces are not supported.
         """
         return Environment(self, seed)
 
@@ -75,18 +75,18 @@ class GymnasiumTask:
 class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
     """A Gymnasium environment as the agent sees it: the entries it observes, float32, and actions in [-1, 1].
 
-    Whatever goes wrong inside is a Fault that names the environment, the seed and the step.
+    Any error inside the environment becomes a Fault that names the environment, the seed and the step.
     """
 
     def __init__(self, task: GymnasiumTask, seed: str = ""):
-        """Make it and check its spaces."""
+        """Make the environment and check its spaces."""
         self.task, self.seed = task, seed
-        self.steps, self.length = 0, 0  # since it was made, and of this episode
+        self.steps, self.length = 0, 0  # in total, and in this episode
         try:
             self.inner = task.make(**task.arguments)
         except UserError:
             raise
-        except Exception as error:  # whatever a stranger's environment may raise
+        except Exception as error:  # an environment may raise anything
             raise UserError(f"{task.name} cannot be made: {said(error)}.") from None
         self.inner_action_space: Any = getattr(self.inner, "action_space", None)
         self.inner_observation_space: Any = getattr(self.inner, "observation_space", None)
@@ -104,37 +104,37 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin an episode."""
+        """Start an episode."""
         self.length = 0
         result = self._call("reset", lambda: self.inner.reset(seed=seed, options=options))
         if not (isinstance(result, tuple) and len(result) == 2):
-            raise self._fault("reset returned no pair (observation, info)")
+            raise self._fault("reset did not return (observation, info)")
         return self._seen(result[0]), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Do an action in [-1, 1]."""
+        """Apply an action in [-1, 1]."""
         self.steps, self.length = self.steps + 1, self.length + 1
         scaled = self._scaled(action)
         result = self._call("step", lambda: self.inner.step(scaled))
         if not (isinstance(result, tuple) and len(result) == 5):
-            raise self._fault("step returned no five (observation, reward, terminated, truncated, info)")
+            raise self._fault("step did not return (observation, reward, terminated, truncated, info)")
         obs, reward, terminated, truncated, info = result
         obs, reward = self._seen(obs), self._number(reward)
         terminated, truncated = self._flag(terminated, "terminated"), self._flag(truncated, "truncated")
         truncated = truncated or self.length == self.task.max_steps
         if not (terminated or truncated) and self.length >= (self.limit or ENDLESS):
             raise self._fault(
-                f"the episode has not ended after {self.length} steps: mend the environment, or give it a time limit "
+                f"the episode has not ended after {self.length} steps: fix the environment, or give it a time limit "
                 "with max_episode_steps"
             )
         return obs, reward, terminated, truncated, {"success": success_of(info)}
 
     def render(self) -> Any:
-        """What the environment itself renders."""
+        """The picture that the environment renders."""
         return self.inner.render()
 
     def close(self) -> None:
-        """Close it; what goes wrong in that concerns nobody any more."""
+        """Close the environment, ignoring errors."""
         try:
             self.inner.close()
         except Exception:
@@ -147,31 +147,31 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
     def _call(self, name: str, function: Callable[[], Any]) -> Any:
         try:
             result = function()
-        except (Exception, SystemExit) as error:  # whatever a stranger's environment may raise
+        except (Exception, SystemExit) as error:  # an environment may raise anything
             raise self._fault(f"{name} raised {said(error)}") from None
         space = self.inner.action_space
         if space is not self.inner_action_space and space != self.inner_action_space:
             raise self._fault(
-                f"its action space changed from {short(self.inner_action_space)} to {short(space)}, which must stay"
+                f"its action space changed from {short(self.inner_action_space)} to {short(space)}, but must not change"
             )
         return result
 
     def _scaled(self, action: np.ndarray) -> np.ndarray:
-        """From [-1, 1] to the bounds of the environment."""
+        """The action, scaled from [-1, 1] to the bounds of the environment."""
         space = self.inner_action_space
         unit = np.clip(np.asarray(action, np.float64).reshape(space.shape), -1.0, 1.0) / 2 + 0.5
         scaled = space.low + unit * (space.high.astype(np.float64) - space.low)
-        return np.clip(scaled.astype(space.dtype), space.low, space.high)  # rounding may overstep
+        return np.clip(scaled.astype(space.dtype), space.low, space.high)  # rounding may exceed the bounds
 
     def _seen(self, obs: Any) -> np.ndarray:
-        """The entries that the agent observes, float32."""
+        """The entries that the agent observes, as float32, after all checks."""
         space = self.inner_observation_space
         if isinstance(space, spaces.Box):
             value = _array(obs)
             if value.dtype.kind not in "biuf":
-                raise self._fault(f"the observation is of type {value.dtype}, where its space says {space.dtype}")
+                raise self._fault(f"the observation has type {value.dtype}, but its space says {space.dtype}")
             if value.shape != space.shape:
-                raise self._fault(f"the observation has shape {value.shape}, where its space says {space.shape}")
+                raise self._fault(f"the observation has shape {value.shape}, but its space says {space.shape}")
         else:
             try:
                 value = np.asarray(spaces.flatten(space, obs))
@@ -190,7 +190,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
             bounds = flat_bounds(space)
             raise self._fault(
                 f"entry {entry} of the observation is {value.reshape(-1)[entry]}, far outside its space, which says "
-                f"{bounds.low[entry]} to {bounds.high[entry]}: correct the observation, or its space"
+                f"{bounds.low[entry]} to {bounds.high[entry]}: correct the observation or its space"
             )
         return flat
 
@@ -198,7 +198,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         value = _array(reward)
         if value.shape != () or value.dtype.kind not in "biuf":
             shown = f"of shape {value.shape}" if value.shape else repr(reward)
-            raise self._fault(f"the reward is {shown}, where it must be one number")
+            raise self._fault(f"the reward is {shown}, but must be one number")
         with np.errstate(over="ignore"):
             if not np.isfinite(value.astype(np.float32)):
                 raise self._fault(f"the reward is {value}")
@@ -206,12 +206,12 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def _flag(self, value: Any, name: str) -> bool:
         if not isinstance(value, bool | np.bool_ | int | np.integer) or value not in (0, 1):
-            raise self._fault(f"{name} is {short(value)}, where it must be True or False")
+            raise self._fault(f"{name} is {short(value)}, but must be True or False")
         return bool(value)
 
 
 def success_of(info: Any) -> bool:
-    """Whether the step's info tells of success, under either of the names in use."""
+    """Whether the info of a step reports success, as `is_success` or `success`."""
     return isinstance(info, dict) and bool(np.any(info.get("is_success", info.get("success", False))))
 
 

@@ -18,7 +18,7 @@ from beliefrl.types import Spec, check_range
 
 
 class PendulumState(NamedTuple):
-    theta: Float[Array, ""]  # rad, 0 upright, grows without bound as it turns
+    theta: Float[Array, ""]  # rad, 0 upright, not wrapped
     theta_dot: Float[Array, ""]  # rad/s
 
 
@@ -35,9 +35,9 @@ class Pendulum:
     max_torque: float = 2.0
     """N m, at action 1."""
     max_speed: float = 8.0
-    """rad/s, to which the speed is clipped."""
+    """rad/s, limit of the angular speed."""
     dt: float = 0.05
-    """s, the length of a step."""
+    """s, duration of a step."""
     max_steps: int = 200
     """Time limit in steps."""
 
@@ -46,7 +46,7 @@ class Pendulum:
     POSITIONS: ClassVar[tuple[int, ...]] = (0, 1)
 
     def __post_init__(self) -> None:
-        """Refuse impossible values with a UserError."""
+        """Raise a UserError for impossible values."""
         check_range(self, ("mass", "length", "max_torque", "max_speed"), 0.001, 1000)
         check_range(self, ("gravity",), 0, 1000)
         check_range(self, ("dt",), 0.0001, 1)
@@ -81,14 +81,14 @@ class Pendulum:
         return jnp.array(False)
 
     def draw(self, states: Sequence[PendulumState]) -> Picture:
-        """The rod on its hub, and the way its tip has come in the last half second; θ grows anticlockwise."""
+        """The rod, its hub, and the path of its tip in the last half second. θ grows anticlockwise."""
         angles = np.array([state.theta for state in states[-round(0.5 / self.dt) - 1 :]])
         fine = np.interp(np.linspace(0, len(angles) - 1, 8 * len(angles)), np.arange(len(angles)), angles)
-        way = self.length * np.stack([-np.sin(fine), np.cos(fine)], axis=-1)
+        path = self.length * np.stack([-np.sin(fine), np.cos(fine)], axis=-1)
         size, hub = self.length, (0.0, 0.0)
         shapes = [
-            Line(way, 0.08 * size, PALE),
-            Line([hub, way[-1]], 0.17 * size, BLUE),
+            Line(path, 0.08 * size, PALE),
+            Line([hub, path[-1]], 0.17 * size, BLUE),
             Circle(hub, 0.045 * size, INK),
         ]
         return Picture((-1.3 * size, -1.3 * size), (1.3 * size, 1.3 * size), shapes)

@@ -1,8 +1,8 @@
-"""Environments by their Gymnasium names, the robots of the paper among them, and which entries are velocities.
+"""Environments by Gymnasium id, including the robots of the paper, and the indices of their velocities.
 
-Robots: pybullet_envs_gymnasium's, the descendants of the paper's Roboschool (Appendix B, Table 4), whose observations
-they share: 8 numbers of the body, then angle and speed of every joint, then the feet's contacts. MuJoCo's and the
-classic ones are Gymnasium's own.
+The robots are those of pybullet_envs_gymnasium, the successor of the paper's Roboschool (Appendix B, Table 4). The
+observations are the same: 8 numbers of the body, then angle and speed of every joint, then the contacts of the feet.
+MuJoCo's and the classic environments are Gymnasium's own.
 """
 
 import contextlib
@@ -27,13 +27,13 @@ BULLET = "pybullet_envs_gymnasium"
 
 
 class Known(NamedTuple):
-    """An environment whose observation has names for its parts."""
+    """An environment with known velocities and positions in its observation."""
 
     id: str
     about: str
     velocities: tuple[int, ...]
-    positions: tuple[int, ...]  # all that are no velocities
-    extra: str | None = None  # of this package, that it needs
+    positions: tuple[int, ...]  # all other entries
+    extra: str | None = None  # the extra of this package that it needs
 
 
 def _known(id: str, about: str, size: int, velocities: tuple[int, ...], extra: str | None = None) -> Known:
@@ -76,7 +76,7 @@ KNOWN: dict[str, Known] = {known.id: known for known in (*ROBOTS.values(), *GYMN
 
 
 def names() -> dict[str, str]:
-    """Gymnasium's environments whose masks are known by name, with a sentence on each; and what else there is."""
+    """The name and a description of each Gymnasium environment with known velocities, and of the form "gym:ID"."""
     listed = {}
     for known in GYMNASIUMS:
         extra = f" Needs the extra `{known.extra}`." if known.extra else ""
@@ -86,21 +86,21 @@ def names() -> dict[str, str]:
 
 
 def ids() -> list[str]:
-    """The ids that Gymnasium knows by itself, without those of this library, whose tasks have names of their own."""
+    """The registered ids of Gymnasium, except for this library's tasks, which have their own names."""
     return [id for id in gymnasium.registry if not id.startswith("BeliefRL/")]
 
 
 def similar(id: str) -> str | None:
-    """The task whose Gymnasium id, `Id` or `package:Id`, is most like this one; of several versions the newest."""
+    """The task with the most similar Gymnasium id, `Id` or `package:Id`; the newest of several versions."""
     package, colon, name = id.rpartition(":")
     near = difflib.get_close_matches(name, ids(), n=1, cutoff=0.8)
     return f"{PREFIX}{package}{colon}{near[0]}" if near else None
 
 
 def make(id: str, arguments: dict[str, Any], name: str | None = None) -> GymnasiumTask:
-    """The task of a Gymnasium id, `Id` or `package:Id`, which imports the package that registers it.
+    """The task with a Gymnasium id, `Id` or `package:Id`; the package is imported, to register the environment.
 
-    `arguments` are gymnasium.make's: max_episode_steps, and those of the environment itself.
+    `arguments` are those of gymnasium.make: max_episode_steps, and the environment's own.
 
     Raises:
         UserError: there is no such environment, a package is missing, or an argument is impossible.
@@ -128,13 +128,13 @@ def _import(package: str, id: str) -> None:
             importlib.import_module(package)
     except ModuleNotFoundError as found:
         raise UserError(_missing(id, found)) from None
-    except Exception as found:  # whatever a stranger's module may raise
+    except Exception as found:  # a module may raise anything
         raise UserError(f"The module {package} cannot be imported: {said(found)}.") from None
 
 
 @dataclasses.dataclass(frozen=True)
 class _Registered:
-    """Makes an environment by its id, in whatever process: a closure might not be sent to another one."""
+    """Makes an environment from its id. Unlike a closure, it can be sent to another process."""
 
     id: str
 
@@ -143,10 +143,10 @@ class _Registered:
         try:
             with _quiet() if package else contextlib.nullcontext():
                 if package:
-                    importlib.import_module(package)  # in a process of its own it has not been yet
+                    importlib.import_module(package)  # a new process has not imported it yet
                 environment = gymnasium.make(name, disable_env_checker=True, **arguments)
                 if package == BULLET:
-                    environment.reset()  # only now PyBullet begins, and says so
+                    environment.reset()  # PyBullet starts only now, and prints a message
         except (ImportError, error.DependencyNotInstalled) as found:
             raise UserError(_missing(self.id, found)) from None
         return environment
@@ -165,19 +165,19 @@ def _first_sentence(found: Exception) -> str:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Nothing on the screen: PyBullet writes there from C when it is imported and whenever an environment begins."""
-    screens = (1, 2)
+    """Suppress all output: PyBullet prints from C when it is imported and when an environment starts."""
+    streams = (1, 2)
     sys.stdout.flush()
-    kept = [os.dup(screen) for screen in screens]
+    kept = [os.dup(stream) for stream in streams]
     try:
-        with pathlib.Path(os.devnull).open("wb") as nowhere:
-            for screen in screens:
-                os.dup2(nowhere.fileno(), screen)
+        with pathlib.Path(os.devnull).open("wb") as devnull:
+            for stream in streams:
+                os.dup2(devnull.fileno(), stream)
         yield
     finally:
         sys.stdout.flush()
         if os.name == "posix":
-            ctypes.CDLL(None).fflush(None)  # what C has not written yet
-        for screen, where in zip(screens, kept, strict=True):
-            os.dup2(where, screen)
-            os.close(where)
+            ctypes.CDLL(None).fflush(None)  # output that C has buffered
+        for stream, original in zip(streams, kept, strict=True):
+            os.dup2(original, stream)
+            os.close(original)

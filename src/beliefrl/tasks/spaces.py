@@ -1,4 +1,4 @@
-"""Which of Gymnasium's spaces are supported, and what an observation is when it is flat."""
+"""The Gymnasium spaces that are supported, and their flat observations."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -9,47 +9,49 @@ from jaxtyping import Float, Int
 
 from beliefrl.types import UserError, short
 
-MOST_NUMBERS = 4_000  # in an observation: more are taken for an image
-FAR = 100  # widths of its declared range by which an observation may leave that range
+MOST_NUMBERS = 4_000  # in an observation: a larger one is considered an image
+FAR = 100  # an observation may leave its declared range by this many times the range's width
 
 
 def check_actions(space: Any, name: str) -> None:
-    """Raise a UserError where the actions of the environment of that name are not supported."""
+    """Raise a UserError if the action space of the environment `name` is not supported."""
     if not isinstance(space, spaces.Box):
         raise UserError(
-            f"{name} has the actions {short(space)}: what is supported is a bounded Box of real numbers "
+            f"{name} has the actions {short(space)}: only a bounded Box of real numbers is supported "
             "(continuous control), not discrete or composite actions."
         )
     if not np.issubdtype(space.dtype, np.floating):
-        raise UserError(f"{name} has actions of type {space.dtype}: what is supported is a Box of real numbers.")
+        raise UserError(f"{name} has actions of type {space.dtype}: only a Box of real numbers is supported.")
     if space.shape == () or 0 in space.shape:
-        raise UserError(f"{name} has actions of shape {space.shape}: there must be at least one number in a row.")
+        raise UserError(
+            f"{name} has actions of shape {space.shape}: give the Box at least one dimension and at least one number."
+        )
     if not space.is_bounded():
-        raise UserError(f"{name} has unbounded actions: [-1, 1] is scaled to the bounds, so give its Box finite ones.")
+        raise UserError(f"{name} has unbounded actions: give its Box finite bounds, to which [-1, 1] is scaled.")
     for entry in np.flatnonzero(space.low >= space.high):
         bound = space.low.reshape(-1)[entry]
         raise UserError(
-            f"{name} has an action that can only be {bound}, entry {entry} of its Box: give that entry a low below "
-            "its high, or leave it out."
+            f"{name} has an action that can only be {bound}, entry {entry} of its Box: make its low smaller than its "
+            "high, or leave the entry out."
         )
 
 
 def flat_size(space: Any, name: str) -> int:
-    """Numbers in an observation of that space when flat.
+    """The number of entries in a flat observation of a space.
 
     Raises:
-        UserError: images, text, or what does not flatten to a fixed number of numbers, also within a Dict or Tuple.
+        UserError: the space contains images, text, or anything else that does not flatten to a fixed number of entries.
     """
     for where, leaf in _leaves(space):
         if isinstance(leaf, spaces.Box) and _is_image(leaf):
             raise UserError(
-                f"{name} observes images ({short(leaf)}{where}): what is supported are vectors of numbers, such as a "
+                f"{name} observes images ({short(leaf)}{where}): only vectors of numbers are supported, such as a "
                 "robot's sensors."
             )
         if not isinstance(leaf, spaces.Box | spaces.Discrete | spaces.MultiBinary | spaces.MultiDiscrete):
             raise UserError(
-                f"{name} has the observations {short(leaf)}{where}: what is supported is a Box, or what flattens to "
-                "one (Discrete, MultiDiscrete, MultiBinary, Dict and Tuple of these)."
+                f"{name} has the observations {short(leaf)}{where}: only Box, Discrete, MultiDiscrete, MultiBinary, "
+                "and Dict and Tuple of these are supported."
             )
     size = spaces.flatdim(space)
     if not 1 <= size <= MOST_NUMBERS:
@@ -62,7 +64,7 @@ def flat_size(space: Any, name: str) -> int:
 
 
 def _leaves(space: Any, where: str = "") -> Iterator[tuple[str, Any]]:
-    """The spaces that a space is composed of, each with its place in words; itself where it is not composed."""
+    """The elementary spaces in a space, each with its position as text, such as " at ['arm'][0]"."""
     if isinstance(space, spaces.Dict | spaces.Tuple):
         parts = space.items() if isinstance(space, spaces.Dict) else enumerate(space)
         for name, part in parts:
@@ -76,16 +78,16 @@ def _is_image(space: spaces.Box) -> bool:
 
 
 def flat_bounds(space: Any) -> spaces.Box:
-    """The space of the flat observation, one that `flat_size` has found to be supported."""
+    """The space of the flat observation. `flat_size` must have accepted the original space."""
     flat = spaces.flatten_space(space)
     assert isinstance(flat, spaces.Box)
     return flat
 
 
 def limits(space: Any, indices: Int[np.ndarray, " obs"]) -> tuple[Float[np.ndarray, " obs"], Float[np.ndarray, " obs"]]:
-    """The least and the greatest values of these entries of the observation that are not far outside its space."""
+    """The smallest and largest accepted values of these entries of the observation: its space, with a wide margin."""
     bounds = flat_bounds(space)
     low, high = bounds.low[indices].astype(np.float64), bounds.high[indices].astype(np.float64)
     with np.errstate(over="ignore"):
-        room = FAR * np.maximum(high - low, 1.0)
-    return low - room, high + room
+        margin = FAR * np.maximum(high - low, 1.0)
+    return low - margin, high + margin

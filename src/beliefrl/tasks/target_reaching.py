@@ -1,10 +1,10 @@
-"""Sequential target reaching: visit red, green and blue in that order, without being told which is next (Section 5.3).
+"""Sequential target reaching: visit red, green and blue in that order; nothing shows which is next (Section 5.3).
 
-A robot on two wheels in a square field perceives all three targets, and a reward for one step where it reaches
-the one that is due: what it has reached already it must remember.
+A robot on two wheels moves in a square field. It perceives all three targets. When it reaches the next target of the
+order, it gets a reward in that step. It must remember which targets it has already reached.
 
-    forward = speed (a_1 + a_2) / 2 along the heading as it stood;   turn = (a_1 - a_2) / 2 / axle
-    r = -0.1 where the robot would leave the field (it stays),  K / (1 + distance) at the target that is due,  else 0
+    forward = speed (a_1 + a_2) / 2 along the old heading;   turn = (a_1 - a_2) / 2 / axle
+    r = -0.1 if the robot would leave the field (it stays),  K / (1 + distance) at the next target,  0 otherwise
 """
 
 import dataclasses
@@ -24,8 +24,8 @@ class TargetReachingState(NamedTuple):
     position: Float[Array, "2"]  # in [0, field]²
     heading: Float[Array, ""]  # rad in [0, 2π)
     targets: Float[Array, "3 2"]  # red, green, blue
-    reached: Int[Array, ""]  # how many have been reached, 0 to 3
-    reward: Float[Array, ""]  # the last one
+    reached: Int[Array, ""]  # number of targets reached, 0 to 3
+    reward: Float[Array, ""]  # of the last step
 
 
 def wall_distance(position: Float[Array, "2"], heading: Float[Array, ""], field: float) -> Float[Array, ""]:
@@ -40,31 +40,31 @@ class TargetReaching:
     """Reach three targets in a hidden order (long-term memory): 12 numbers; 2 actions; 128 steps."""
 
     field: float = 15.0
-    """Side of the field."""
+    """Side length of the field."""
     target_square: float = 4.0
-    """Side of the square in the middle of the field where targets lie."""
+    """Side length of the square in the middle of the field that contains the targets."""
     min_squared_gap: float = 2.0
-    """Every two targets are further apart than this, squared."""
+    """Lower bound of the squared distance between any two targets."""
     radius: float = 0.4
     """A target is reached within this distance."""
     speed: float = 0.8
-    """Distance in a step at full speed of both wheels."""
+    """Distance per step at full speed of both wheels."""
     axle: float = 0.5
-    """Distance of the wheels: full opposite speeds turn by 1 / axle rad in a step."""
+    """Distance between the wheels: full speed in opposite directions turns the robot by 1 / axle rad per step."""
     rewards: tuple[float, float, float] = (20.0, 50.0, 100.0)
-    """K of the first, second and third target."""
+    """Factor K of the reward at the first, second and third target."""
     wall_reward: float = -0.1
     """Reward of a step that would leave the field."""
     scale: float = 3.0
-    """Distances d are seen as exp(-d / scale)."""
+    """A distance d is observed as exp(-d / scale)."""
     max_steps: int = 128
     """Time limit in steps."""
 
     def __post_init__(self) -> None:
-        """Refuse impossible values with a UserError."""
+        """Raise a UserError for impossible values."""
         check_range(self, ("field", "radius", "speed", "axle", "scale"), 0.001, 1000)
         check_range(self, ("target_square",), 0.001, self.field)
-        check_range(self, ("min_squared_gap",), 0, self.target_square**2 / 2)  # else targets are redrawn for ever
+        check_range(self, ("min_squared_gap",), 0, self.target_square**2 / 2)  # no larger gap fits
         check_range(self, ("rewards", "wall_reward"), -1000, 1000)
         check_range(self, ("max_steps",), 1)
 
@@ -79,7 +79,7 @@ class TargetReaching:
         return Spec(obs_dim=12, action_dim=2, max_steps=self.max_steps, has_success=True)
 
     def draw_targets(self, key: Key[Array, ""]) -> Float[Array, "3 2"]:
-        """Three targets uniform in the middle square, redrawn until no two are too close."""
+        """Three uniform targets in the middle square, redrawn until no two are too close."""
         low, high = (self.field - self.target_square) / 2, (self.field + self.target_square) / 2
 
         def draw(key: Key[Array, ""]) -> Float[Array, "3 2"]:
@@ -97,7 +97,7 @@ class TargetReaching:
         return jax.lax.while_loop(too_close, redraw, redraw((key, jnp.zeros((3, 2)))))[1]
 
     def observation(self, state: TargetReachingState) -> Float[Array, "12"]:
-        """Nearness of red, green, blue, of the wall ahead and behind; sin and cos of the bearings; the last reward."""
+        """Nearness of red, green, blue and the walls ahead and behind; sin and cos of the bearings; the last reward."""
         offset = state.targets - state.position[None]
         distance = jnp.sqrt(jnp.sum(offset**2, axis=-1))
         bearing = jnp.arctan2(offset[:, 1], offset[:, 0]) - state.heading
@@ -140,10 +140,10 @@ class TargetReaching:
         return state.reached >= 3
 
     def draw(self, states: Sequence[TargetReachingState]) -> Picture:
-        """The field, its targets with a tick where they are reached, and the robot with the way it has come."""
+        """The field, the targets with a tick on those reached, and the robot with its path so far."""
         state, side, margin = states[-1], self.field, 0.04 * self.field
         corners = [(0, 0), (side, 0), (side, side), (0, side), (0, 0)]
-        body, centre = 1.4 * self.radius, np.asarray(state.position)  # seen around the target that it is at
+        body, centre = 1.4 * self.radius, np.asarray(state.position)  # larger than a target, so that both are visible
         ahead = np.array([np.cos(state.heading), np.sin(state.heading)])
         across = np.array([-ahead[1], ahead[0]])
         shapes: list[Circle | Line | Polygon] = [

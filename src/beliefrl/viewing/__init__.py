@@ -1,1 +1,1 @@
-"""Trained agents to look at: one episode step by step, films, predictions of the model."""
+"""Ways to look at a trained agent: a single episode, videos and film strips, predictions of its model."""

@@ -1,9 +1,9 @@
-"""One episode of a trained agent on any task, moment by moment.
+"""Play one episode of a trained agent on any task, and record every time step.
 
     trajectory = beliefrl.play("runs/first", at=range(0, 200, 20))
     trajectory.total, trajectory.steps.obs, trajectory.frames[20]
 
-A JAX task is played as a Gymnasium environment too (`environment.TaskEnvironment`), so there is one loop for all.
+A JAX task is wrapped as a Gymnasium environment (`environment.TaskEnvironment`), so one loop serves all tasks.
 """
 
 import os
@@ -24,24 +24,24 @@ from beliefrl.viewing.rendering import Pixels
 
 
 class Trajectory(NamedTuple):
-    """An episode as it was played. It has one moment more than steps: the last observation is a moment too."""
+    """A recorded episode. After T actions it has T + 1 time steps, from the first observation to the last."""
 
-    steps: Timestep  # numpy, leaves (time, ...); reward[t] and prev_action[t] came before obs[t]
+    steps: Timestep  # numpy, leaves (time, ...); prev_action[t] led to reward[t] and obs[t]
     total: float  # undiscounted return
-    success: bool | None  # whether it reached its aim; None where the task has none
-    frames: dict[int, Pixels]  # those that were asked for, by the moment they show
+    success: bool | None  # whether it succeeded; None if the task does not define success
+    frames: dict[int, Pixels]  # the requested frames, by time step
 
 
 class Frame(NamedTuple):
-    """A moment as it looks."""
+    """The rendered picture of one time step."""
 
-    time: int  # steps before it
-    total: float  # rewards before it
+    time: int  # actions before it
+    total: float  # sum of the rewards up to it
     pixels: Pixels
 
 
 class Player:
-    """Plays episodes with one trained state of an agent in one environment; a context that closes it."""
+    """Plays episodes with a trained agent in one environment; a context manager that closes the environment."""
 
     def __init__(
         self,
@@ -51,10 +51,10 @@ class Player:
         precision: str = "float32",
         rendered: bool = False,
     ):
-        """`precision`: of matrix products (`Run.precision`). `rendered`: whether frames will be asked for.
+        """`precision` is for matrix products (`Run.precision`). `rendered` must be true if frames will be requested.
 
         Raises:
-            UserError: the environment cannot be made, or not so that it can be rendered.
+            UserError: the environment cannot be made, or cannot be rendered although it must.
         """
         self.agent, self.task = agent, task
         self.environment = rendering.environment(task, rendered)
@@ -80,17 +80,17 @@ class Player:
         at: Container[int] = (),
         watch: Callable[[Frame], None] | None = None,
     ) -> Trajectory:
-        """Play an episode; `play` below tells the arguments.
+        """Play an episode. The arguments are those of the function `play`.
 
-        With `watch` the frames are given to it, one by one, and the trajectory keeps none.
+        With `watch`, each frame is passed to it, and the trajectory keeps no frames.
         """
         spec, key, frames = self.task.spec, jax.random.key(seed), {}
         limit = min(steps or LARGEST, spec.max_steps)
         obs, _ = self.environment.reset(seed=seed)
-        moments = [_moment(obs, 0.0, np.zeros(spec.action_dim), is_first=True)]
+        played = [_timestep(obs, 0.0, np.zeros(spec.action_dim), is_first=True)]
         memory, total, done, success = self.agent.reset(spec), 0.0, False, False
         while True:
-            time = len(moments) - 1
+            time = len(played) - 1
             done = done or time >= limit
             if time in at or (done and at):
                 frame = Frame(time, total, rendering.pixels(self.environment))
@@ -99,16 +99,16 @@ class Player:
                     watch(frame)
             if done:
                 break
-            action, memory = self._act(self._state, memory, moments[-1], key, time, sampled)
+            action, memory = self._act(self._state, memory, played[-1], key, time, sampled)
             obs, reward, terminated, truncated, info = self.environment.step(np.asarray(action))
             total, done, success = total + reward, terminated or truncated, success_of(info)
-            moments.append(_moment(obs, reward, action, terminated=terminated))
-        steps_played = jax.tree.map(lambda *leaves: np.stack(leaves), *moments)
+            played.append(_timestep(obs, reward, action, terminated=terminated))
+        steps_played = jax.tree.map(lambda *leaves: np.stack(leaves), *played)
         return Trajectory(steps_played, total, success if spec.has_success else None, frames)
 
 
-def _moment(obs: Any, reward: float, action: Any, is_first: bool = False, terminated: bool = False) -> Timestep:
-    """A moment in numpy."""
+def _timestep(obs: Any, reward: float, action: Any, is_first: bool = False, terminated: bool = False) -> Timestep:
+    """A time step in numpy."""
     numbers: Any = np.asarray(obs, np.float32), np.float32(reward), np.asarray(action, np.float32)
     flags: Any = np.bool_(is_first), np.bool_(terminated)
     return Timestep(*numbers, *flags)
@@ -124,17 +124,18 @@ def play(
     task: Task | GymnasiumTask | None = None,
     agent: Agent | type | None = None,
 ) -> Trajectory:
-    """Play an episode with what a run has learned.
+    """Play an episode with the trained agent of a run.
 
     Args:
         run: a run, or its folder.
-        seed: which of the run's seeds; None is its first.
-        episode_seed: of the episode and its actions: the same one gives the same episode.
-        sampled: whether actions are sampled; else they are the policy's mode.
-        steps: end it after so many; None: when the task does.
-        at: the moments of which a frame is kept, and with them the last one; range(0, 1000, 10) is every tenth.
-        task: needed only where the run was trained on a task of your own.
-        agent: needed only where an agent of your own was trained: its class, or one of them.
+        seed: one of the run's seeds; None: its first.
+        episode_seed: random seed of the episode and its actions. The same seed gives the same episode.
+        sampled: sample the actions, instead of taking the policy's mode.
+        steps: stop after this many steps; None: play until the task ends the episode.
+        at: time steps of which to keep a frame, such as range(0, 1000, 10). The last time step is added, unless `at` is
+            empty.
+        task: needed only if the run was trained on a task of your own.
+        agent: needed only if the run was trained by an agent of your own: its class, or an instance.
 
     Raises:
         UserError: there is no such run or seed, a number is impossible, or the task fails or cannot be rendered.
@@ -145,7 +146,7 @@ def play(
 
 
 def check_episode(episode_seed: int, steps: int | None = None) -> None:
-    """Raise a UserError where one of them is impossible."""
+    """Raise a UserError if one of the arguments is out of range."""
     if not 0 <= episode_seed <= LARGEST:
         raise UserError(f"episode_seed={episode_seed} is impossible: it must be from 0 to {LARGEST}.")
     if steps is not None and not 1 <= steps <= LARGEST:

@@ -1,7 +1,7 @@
-"""Films and film strips of trained agents.
+"""Videos and film strips of trained agents.
 
-A film is an mp4 (imageio-ffmpeg brings the encoder; extra `video`) or a GIF (Pillow). A film strip is a row of frames
-for each run, evenly spaced in time (Appendix "Visualization of Trained Agents").
+A video is an mp4 file (encoded by imageio-ffmpeg, extra `video`) or a GIF (encoded by Pillow). A film strip has one row
+of frames per run, evenly spaced in time (Appendix "Visualization of Trained Agents").
 """
 
 import math
@@ -29,7 +29,7 @@ from beliefrl.viewing import rendering
 from beliefrl.viewing.episodes import Frame, Player, Trajectory, check_episode
 from beliefrl.viewing.rendering import Pixels
 
-FASTEST = 50  # frames a second: what both a GIF and a screen can show
+FASTEST = 50  # frames per second that GIFs and screens can show
 Writer = Callable[[Pixels], None]
 
 
@@ -45,20 +45,20 @@ def video(
     task: Task | GymnasiumTask | None = None,
     agent: Agent | type | None = None,
 ) -> list[Trajectory]:
-    """Film episodes of what a run has learned; returns them, without frames. The file is there whole or not at all.
+    """Record a video of a run's trained agent; returns the episodes, without frames. No file is left half written.
 
     Args:
         run: a run, or its folder.
-        path: of the film, .mp4 or .gif; a file that is there is replaced.
-        seed: which of the run's seeds; None is its first.
-        episode_seed: of the first episode; the next ones have the numbers that follow.
-        sampled: whether actions are sampled; else they are the policy's mode.
-        episodes: how many, one after the other.
-        fps: steps in a second of the film, a frame each; None is real time (10 where the task does not tell its time),
-            in which steps beyond 50 a second are left out.
-        steps: end each episode after so many; None: when the task does.
-        task: needed only where the run was trained on a task of your own.
-        agent: needed only where an agent of your own was trained: its class, or one of them.
+        path: the video, .mp4 or .gif. An existing file is replaced.
+        seed: one of the run's seeds; None: its first.
+        episode_seed: random seed of the first episode; the next episodes have the following seeds.
+        sampled: sample the actions, instead of taking the policy's mode.
+        episodes: number of episodes, shown one after the other.
+        fps: time steps per second of the video, each with a frame. None: real time, with at most 50 frames per second;
+            a task whose step has no known duration gets 10 steps per second.
+        steps: stop each episode after this many steps; None: play until the task ends it.
+        task: needed only if the run was trained on a task of your own.
+        agent: needed only if the run was trained by an agent of your own: its class, or an instance.
 
     Raises:
         UserError: there is no such run or seed, a number is impossible, the task cannot be rendered, imageio-ffmpeg is
@@ -75,7 +75,7 @@ def video(
     with Player(*restore_seed(run, seed, task, agent), rendered=True) as player:
         pace = rendering.pace(player.environment)
         every = 1 if fps else math.ceil(pace / FASTEST)
-        with _written(path, kind, fps or pace / every) as add:
+        with _encoder(path, kind, fps or pace / every) as add:
             return [
                 player.play(
                     episode_seed + index, sampled, steps, range(0, LARGEST, every), _captioned(add, index, episodes)
@@ -85,10 +85,10 @@ def video(
 
 
 def _kind(path: pathlib.Path) -> str:
-    """How the film is to be encoded."""
+    """The file type of the video: ".mp4" or ".gif"."""
     kind = path.suffix.lower()
     if kind not in (".mp4", ".gif"):
-        raise UserError(f"{path} is impossible: a film is an mp4 or a gif, so end its name as .mp4 or .gif.")
+        raise UserError(f"{path} is impossible: the name of a video must end in .mp4 or .gif.")
     if kind == ".mp4":
         try:
             import imageio_ffmpeg  # noqa: F401  # pyright: ignore[reportMissingImports]
@@ -98,7 +98,7 @@ def _kind(path: pathlib.Path) -> str:
 
 
 def _captioned(add: Writer, index: int, episodes: int) -> Callable[[Frame], None]:
-    """Adds an episode's frames with a line below them."""
+    """A function that adds a frame of an episode, with its step and return below."""
     which = f"episode {index + 1}   " if episodes > 1 else ""
 
     def watch(frame: Frame) -> None:
@@ -108,7 +108,7 @@ def _captioned(add: Writer, index: int, episodes: int) -> Callable[[Frame], None
 
 
 def caption(pixels: Pixels, text: str) -> UInt8[np.ndarray, "taller wider 3"]:
-    """The picture with a line of text below it; both sides are even, as video encoders want them."""
+    """The picture with a line of text below it. Width and height are even, as video encoders require."""
     height, width, _ = pixels.shape
     size = max(12, width // 30)
     image = Image.new("RGB", (width + width % 2, height + 2 * size + height % 2), PAPER)
@@ -119,8 +119,8 @@ def caption(pixels: Pixels, text: str) -> UInt8[np.ndarray, "taller wider 3"]:
 
 
 @contextmanager
-def _written(path: pathlib.Path, kind: str, fps: float) -> Iterator[Writer]:
-    """A function that adds a frame to the film."""
+def _encoder(path: pathlib.Path, kind: str, fps: float) -> Iterator[Writer]:
+    """A function that adds a frame to the video."""
     write, shapes = {".mp4": _mp4, ".gif": _gif}[kind], set()
     try:
         with replacing(path) as temporary, write(temporary, fps) as add:
@@ -128,7 +128,7 @@ def _written(path: pathlib.Path, kind: str, fps: float) -> Iterator[Writer]:
             def checked(pixels: Pixels) -> None:
                 shapes.add(pixels.shape)
                 if len(shapes) > 1:
-                    raise UserError("The environment renders frames of different sizes: make it keep to one.")
+                    raise UserError("The environment renders frames of different sizes: all must have the same size.")
                 add(pixels)
 
             yield checked
@@ -138,10 +138,10 @@ def _written(path: pathlib.Path, kind: str, fps: float) -> Iterator[Writer]:
 
 @contextmanager
 def _mp4(path: pathlib.Path, fps: float) -> Iterator[Writer]:
-    """H.264 that any player shows; frames go to ffmpeg one by one."""
+    """Encode as H.264, which any player shows; each frame is piped to ffmpeg."""
     import imageio_ffmpeg  # pyright: ignore[reportMissingImports]
 
-    # Its own writer forks a process in which JAX runs threads, which may never return.
+    # imageio-ffmpeg's own writer forks this process. That may hang, since JAX runs threads in it.
     encoding = [
         "-c:v",
         "libx264",
@@ -163,15 +163,15 @@ def _mp4(path: pathlib.Path, fps: float) -> Iterator[Writer]:
             size = f"{pixels.shape[1]}x{pixels.shape[0]}"
             given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", f"{fps}", "-i", "-"]
             command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-y", *given, *encoding]
-            pipe = subprocess.PIPE  # Ctrl-C is not meant for it
+            pipe = subprocess.PIPE  # so Ctrl-C does not reach ffmpeg
             encoder = subprocess.Popen(command, stdin=pipe, stderr=pipe, start_new_session=True)
         encoder.stdin.write(pixels.tobytes())
 
     try:
         yield add
-        told = encoder.communicate()[1].decode(errors="replace").strip()
+        message = encoder.communicate()[1].decode(errors="replace").strip()
         if encoder.returncode:
-            raise OSError(told)
+            raise OSError(message)
     finally:
         if encoder is not None and encoder.poll() is None:
             encoder.kill()
@@ -180,10 +180,10 @@ def _mp4(path: pathlib.Path, fps: float) -> Iterator[Writer]:
 
 @contextmanager
 def _gif(path: pathlib.Path, fps: float) -> Iterator[Writer]:
-    """Frames are kept with 256 colours each until the last one is there."""
+    """Keep all frames, reduced to 256 colours, and encode them at the end."""
     frames: list[Image.Image] = []
     yield lambda pixels: frames.append(Image.fromarray(pixels).quantize(dither=Image.Dither.NONE))
-    delay = max(2, round(100 / fps)) * 10  # milliseconds, of which a GIF knows tens
+    delay = max(2, round(100 / fps)) * 10  # milliseconds, a multiple of 10 as GIF requires
     frames[0].save(path, "GIF", save_all=True, append_images=frames[1:], duration=delay, loop=0)
 
 
@@ -198,21 +198,20 @@ def film(
     task: Task | GymnasiumTask | None = None,
     agent: Agent | type | None = None,
 ) -> pathlib.Path:
-    """Draw a film strip: a row for each run, of one episode's frames, evenly spaced, from its first moment to its last.
+    """Draw a film strip: one row per run, with evenly spaced frames of one episode, from its first to its last step.
 
-    Below each frame is its step. Writes a PNG and a PDF, returns the first.
+    The step is written below each frame. Writes a PNG and a PDF; returns the path of the PNG.
 
     Args:
         runs: runs, or their folders.
-        path: of the PNG or the PDF; None is film.png in the first run's folder.
-        frames: in a row.
-        seed: which of each run's seeds; None is its first.
-        episode_seed: of the episodes.
-        sampled: whether actions are sampled; else they are the policy's mode.
-        steps: end the episodes after so many; None: when the task does.
-        task: needed only where the runs were trained on a task of your own.
-        agent: needed only where agents of your own were trained: their class, or one of them. Runs of other agents are
-            drawn without it.
+        path: the PNG or the PDF; None: film.png in the first run's folder.
+        frames: number of frames in a row.
+        seed: one of each run's seeds; None: its first.
+        episode_seed: random seed of the episodes.
+        sampled: sample the actions, instead of taking the policy's mode.
+        steps: stop the episodes after this many steps; None: play until the task ends them.
+        task: needed only if the runs were trained on a task of your own.
+        agent: needed only if the run was trained by an agent of your own: its class, or an instance.
 
     Raises:
         UserError: there is no such run or seed, a number is impossible, or a task cannot be rendered.
@@ -221,7 +220,7 @@ def film(
     if not 2 <= frames <= 100:
         raise UserError(f"frames={frames} is impossible: it must be a whole number from 2 to 100.")
     if not runs:
-        raise UserError("RUN is missing: give one run or more.")
+        raise UserError("RUN is missing: give one or more runs.")
     runs = [run if isinstance(run, Run) else Run(run) for run in runs]
     path = pathlib.Path(path or runs[0].folder / "film.png")
     figures.paths(path)
@@ -236,7 +235,7 @@ def film(
 def _strip(
     run: Run, frames: int, seed: int | None, episode_seed: int, sampled: bool, steps: int | None, task: Any, agent: Any
 ) -> Trajectory:
-    """An episode with evenly spaced frames. It is played twice: only then is it known how long it is."""
+    """An episode with evenly spaced frames. It is played twice, since the first time gives its length."""
     with Player(*restore_seed(run, seed, task, agent), rendered=True) as player:
         length = len(player.play(episode_seed, sampled, steps).steps.reward) - 1
         at = {round(time) for time in np.linspace(0, length, frames)}
@@ -244,7 +243,7 @@ def _strip(
 
 
 def _draw_strips(runs: Sequence[Run], rows: Sequence[Trajectory]) -> Any:
-    """Every frame is as wide as the others, with its step below it, and above each row what it is of."""
+    """The figure: all frames have the same width, with the step below; each row has a title."""
     side, gap, above, below = 1.5, 0.06, 0.28, 0.26  # inches
     ratios = [max(frame.shape[0] / frame.shape[1] for frame in row.frames.values()) for row in rows]
     width = side * max(len(row.frames) for row in rows)

@@ -1,12 +1,12 @@
-"""What an agent's model predicts of what it perceives, beside the truth (Appendix "Model Accuracy").
+"""Compare the predictions of an agent's model with the true observations and rewards (Appendix "Model Accuracy").
 
-An episode is played, and its x_t = (o_t, r_{t-1}) are predicted in two ways, always with the actions that were done:
+The agent plays an episode. Its model predicts each x_t = (o_t, r_{t-1}) in two ways, given the actions of the episode:
 
-    open loop     z_t is inferred from x_t itself, then x_t is decoded: how well the model takes in what it perceives
-    closed loop   x_t is perceived for t < start; from there on z_t is drawn from the prior and x_t from the decoder,
-                  and the model goes on from its own draws: what it knows of the future
+    open loop     z_t is inferred from x_t, then x_t is decoded. This measures how well the model encodes its input.
+    closed loop   For t < start as in the open loop. From `start` on, z_t is sampled from the prior and x_t from the
+                  decoder, and the model continues from its own samples. This measures how well it predicts the future.
 
-Each is the mean of many draws. σ is that of the mixture they are: σ² = mean of the decoder's σ² + variance of its μ.
+A prediction is the mean of many samples. σ is that of their mixture: σ² = mean of the decoder's σ² + variance of its μ.
 """
 
 import os
@@ -32,23 +32,23 @@ from beliefrl.training.evaluation import restore_seed
 from beliefrl.types import LARGEST, Timestep, UserError, perception
 from beliefrl.viewing.episodes import Player, check_episode
 
-START = 50  # moments that the closed loop sees by default
+START = 50  # default number of time steps that the closed loop observes
 TRUTH, OPEN, CLOSED = "#a9a79e", "#1f6f8b", "#c8553d"
 
 
 class Predictions(NamedTuple):
-    """Predictions of one episode; an entry at time t is of x_t, which is the observation's entries and the reward."""
+    """Predictions of one episode. The columns are the entries of x_t: the observed entries, then the reward."""
 
     title: str
-    entries: tuple[int, ...]  # of the task's full observation: what x is of, but for the reward
-    names: tuple[str, ...]  # of the columns of x: the task's names of the entries, or "entry 2"; then "reward"
-    start: int  # the first moment that the closed loop does not see
+    entries: tuple[int, ...]  # indices of the observed entries in the task's full observation
+    names: tuple[str, ...]  # names of the columns: entries of the task, or "entry 2"; then "reward"
+    start: int  # the first time step that the closed loop does not observe
     truth: Float[np.ndarray, "time x"]
-    open_loop: Gaussian  # leaves (time, x); NaN where nothing is predicted; σ = 0 of a deterministic model
-    closed_loop: Gaussian  # the same; before `start` it is the open loop
+    open_loop: Gaussian  # leaves (time, x); NaN where nothing is predicted; σ = 0 for a deterministic model
+    closed_loop: Gaussian  # the same; equal to the open loop before `start`
 
     def errors(self) -> tuple[Float[np.ndarray, " x"], Float[np.ndarray, " x"]]:
-        """The root mean squared error of the open and of the closed loop, both from `start` on."""
+        """The root mean squared errors of the open loop and the closed loop, from `start` on."""
         after = slice(self.start, None)
         loops = (self.open_loop, self.closed_loop)
         return tuple(np.sqrt(np.mean((loop.mean - self.truth)[after] ** 2, axis=0)) for loop in loops)
@@ -63,7 +63,10 @@ def predict(
     samples: int,
     key: Key[Array, ""],
 ) -> Gaussian:
-    """Mean and σ of `samples` draws of a `Predictive` agent's predictions, leaves (time, x)."""
+    """Mean and σ of `samples` sampled predictions of a `Predictive` agent, leaves (time, x).
+
+    `seen` (time,) says which time steps the model observes.
+    """
     draw = jax.vmap(lambda key: agent.predict(state, model, steps, seen, key))
     mean, sigma = draw(jax.random.split(key, samples))
     return Gaussian(jnp.mean(mean, axis=0), jnp.sqrt(jnp.mean(sigma**2, axis=0) + jnp.var(mean, axis=0)))
@@ -81,22 +84,22 @@ def predictions(
     task: Task | GymnasiumTask | None = None,
     agent: Agent | type | None = None,
 ) -> Predictions:
-    """Play an episode with what a run has learned, and predict it.
+    """Play an episode with the trained agent of a run, and predict it with the agent's model.
 
     Args:
         run: a run, or its folder.
-        seed: which of the run's seeds; None is its first.
-        model: "keep" or "first" of vrm, "latent" of slac; None is the first of these that the agent has.
-        start: moments that the closed loop sees; None: 50, or half of a shorter episode.
-        horizon: moments that it predicts then, as far as the episode goes.
-        samples: draws whose mean each prediction is.
-        episode_seed: of the episode, its actions and these draws.
-        sampled: whether actions are sampled; else they are the policy's mode.
-        task: needed only where the run was trained on a task of your own.
-        agent: needed only where an agent of your own was trained: its class, or one of them.
+        seed: one of the run's seeds; None: its first.
+        model: "keep" or "first" for vrm, "latent" for slac; None: the first of these that the agent has.
+        start: number of time steps that the closed loop observes; None: 50, or half of a shorter episode.
+        horizon: number of time steps that it predicts after that, at most to the end of the episode.
+        samples: number of samples in the mean of each prediction.
+        episode_seed: random seed of the episode, its actions and the samples.
+        sampled: sample the actions, instead of taking the policy's mode.
+        task: needed only if the run was trained on a task of your own.
+        agent: needed only if the run was trained by an agent of your own: its class, or an instance.
 
     Raises:
-        UserError: the agent has no such model or none at all, or a number is impossible.
+        UserError: the agent has no such model, or no model, or a number is out of range.
     """
     check_episode(episode_seed)
     _check_sizes(start, horizon, samples)
@@ -105,11 +108,11 @@ def predictions(
     name = _model(run, trained, model)
     with Player(trained, found, state, precision) as player:
         steps = player.play(episode_seed, sampled, (START if start is None else start) + horizon - 1).steps
-    moments = len(steps.reward)
-    start = min(START, moments // 2) if start is None else start
-    if start >= moments:
+    length = len(steps.reward)
+    start = min(START, length // 2) if start is None else start
+    if start >= length:
         raise UserError(
-            f"start={start} is impossible: the episode has {moments} moments, so give {moments - 1} or less."
+            f"start={start} is impossible: the episode has {length} time steps, so give {length - 1} or less."
         )
     steps = jax.tree.map(lambda leaf: leaf[: start + horizon], steps)
 
@@ -131,10 +134,10 @@ def _check_sizes(start: int | None, horizon: int, samples: int) -> None:
 
 
 def _model(run: Run, agent: Any, model: str | None) -> str:
-    """Which of the agent's models to ask."""
+    """The name of the model to predict with."""
     if not isinstance(agent, Predictive):
         raise UserError(
-            f"{run.folder} is of {run.config['agent']}, which has no model to predict with: vrm and slac have one."
+            f"{run.folder} is a run of {run.config['agent']}, which has no model to predict with: use vrm or slac."
         )
     if model is not None and model not in agent.predictors:
         has = ", ".join(agent.predictors)
@@ -145,18 +148,19 @@ def _model(run: Run, agent: Any, model: str | None) -> str:
 def draw_predictions(
     predicted: Predictions, path: pathlib.Path | str, entries: Sequence[int] | None = None
 ) -> pathlib.Path:
-    """Draw predictions beside the truth, a row for each entry of the observation and one for the reward.
+    """Draw predictions and truth, one row for each entry of the observation and one for the reward.
 
-    A row has the task's name of the entry and its unit, or "entry 2", its index in the full observation.
-    Bands are ± σ, and the numbers root mean squared errors from `start` on. Writes a PNG and a PDF, returns the first.
+    A row is labelled with the task's name of the entry and its unit, or with its index in the full observation:
+    "entry 2". Bands are ± σ. Numbers are root mean squared errors from `start` on. Writes a PNG and a PDF; returns the
+    path of the PNG.
 
     Args:
         predicted: what `predictions` returns.
-        path: of the PNG or the PDF.
-        entries: of the observation, in the numbers of `predicted.entries`; None: the first six of them.
+        path: the PNG or the PDF.
+        entries: entries of the observation, a subset of `predicted.entries`; None: the first six of them.
 
     Raises:
-        UserError: the agent sees no such entry, or the files cannot be written.
+        UserError: the agent does not see an entry, or the files cannot be written.
     """
     path = pathlib.Path(path)
     figures.paths(path)
@@ -170,7 +174,7 @@ def draw_predictions(
     axes = figure.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
     for axis, index in zip(axes, rows, strict=True):
         _draw_row(axis, predicted, index)
-        axis.set_ylabel(textwrap.fill(predicted.names[index], 15))  # what a row is high enough for
+        axis.set_ylabel(textwrap.fill(predicted.names[index], 15))  # narrow enough for the height of a row
     figure.align_ylabels(axes)
     figure.suptitle(predicted.title, x=0.01, ha="left", fontsize=10)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=3, frameon=False, fontsize=8)
@@ -179,7 +183,7 @@ def draw_predictions(
 
 
 def _draw_row(axis: Any, predicted: Predictions, index: int) -> None:
-    """The truth of one entry of x, and both loops."""
+    """Draw the truth, the open loop and the closed loop of one entry of x."""
     time, start = np.arange(len(predicted.truth)), predicted.start
     axis.axvline(start - 0.5, color=TRUTH, linewidth=0.8, linestyle=":")
     axis.plot(time, predicted.truth[:, index], color=TRUTH, linewidth=2.8, label="truth")
