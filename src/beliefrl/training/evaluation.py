@@ -16,6 +16,7 @@ from beliefrl.runs.options import MOST_EPISODES
 from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.training.compilation import keep_compiled
 from beliefrl.training.host_evaluation import Evaluation
 from beliefrl.training.phases import evaluate as evaluate_seed
 from beliefrl.training.rollout import Episode
@@ -165,6 +166,7 @@ def evaluate(
         raise UserError(f"seed={seed} is impossible: it must be from 0 to {LARGEST}.")
     run = run if isinstance(run, Run) else Run(run)
     trained, found, states, precision = restore(run, task, agent)
+    keep_compiled()
     keys = jax.random.split(jax.random.key(seed), len(run.seeds))
     with jax.default_matmul_precision(precision):
         if isinstance(found, GymnasiumTask):

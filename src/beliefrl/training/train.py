@@ -26,6 +26,7 @@ from beliefrl.runs.run import Recorder, Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import log
+from beliefrl.training.compilation import keep_compiled
 from beliefrl.training.evaluation import agent_of, as_argument, task_of, tuples
 from beliefrl.training.phases import SeedState
 from beliefrl.training.schedule import Event, Options, Phase, Snapshot, TrainingProgress, capacity, stages
@@ -166,6 +167,7 @@ class _Training:
 
     def run(self, restore: Callable[[SeedState], Snapshot] | None = None) -> Run:
         """Train to the end, or until a signal."""
+        keep_compiled(self._note)
         try:
             with self.recorder, jax.default_matmul_precision(self.options.precision):
                 self._train(restore)
