@@ -104,6 +104,7 @@ def pretrain(
 ) -> tuple[SeedState, Metrics]:
     """Updates `first` to `first + updates` of the pre-training; metrics are their means."""
 
+    @partial(jax.jit, inline=True)  # traced once, for its shapes and for the loop
     def update(seed: SeedState, number: Int[Array, ""]) -> tuple[SeedState, Metrics]:
         key_sample, key = jax.random.split(step_key(seed.key, number, PRETRAIN))
         windows = ring.sample(seed.replay, key_sample, agent.pretrain_windows, agent.window)
@@ -132,11 +133,12 @@ def learn(
     agent: Agent, task: Task, seed: SeedState, first: Int[Array, ""], cycles: Int[Array, ""]
 ) -> tuple[SeedState, Stretch]:
     """`cycles` cycles of learning from environment step `first` on; at most `stretch_length` steps in all."""
-    shapes = jax.eval_shape(partial(_cycle, agent, task), seed, _no_episodes(agent), first, first)[2]
+    one_cycle = jax.jit(partial(_cycle, agent, task), inline=True)  # traced once, for its shapes and for the loop
+    shapes = jax.eval_shape(one_cycle, seed, _no_episodes(agent), first, first)[2]
 
     def step(i, carry):
         seed, log, totals = carry
-        seed, log, metrics = _cycle(agent, task, seed, log, first + i * agent.cycle, i * agent.cycle)
+        seed, log, metrics = one_cycle(seed, log, first + i * agent.cycle, i * agent.cycle)
         return seed, log, jax.tree.map(jnp.add, totals, metrics)
 
     seed, log, totals = jax.lax.fori_loop(0, cycles, step, (seed, _no_episodes(agent), _sum_metrics(shapes)))
