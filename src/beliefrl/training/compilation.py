@@ -11,6 +11,7 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable
+from typing import Any
 
 import filelock
 import jax
@@ -26,7 +27,8 @@ def keep_compiled(note: Callable[[str], None] = warnings.warn) -> None:
 
     A folder that cannot be written is no error: `note` is given a sentence, and everything is compiled anew.
     """
-    if jax.config.jax_compilation_cache_dir or os.environ.get(VARIABLE, "").lower() == "off":
+    settings: Any = jax.config  # its options are made at import, unknown to pyright
+    if settings.jax_compilation_cache_dir or os.environ.get(VARIABLE, "").lower() == "off":
         return
     try:
         folder = cache_folder()
@@ -39,7 +41,7 @@ def keep_compiled(note: Callable[[str], None] = warnings.warn) -> None:
         reason = getattr(error, "strerror", None) or error
         note(f"compiled programs are not kept ({reason}): set {VARIABLE} to a folder that can be written, or to off.")
         return
-    if jax.config.jax_compilation_cache_max_size == -1:
+    if settings.jax_compilation_cache_max_size == -1:
         jax.config.update("jax_compilation_cache_max_size", LARGEST_BYTES)
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST_SECONDS)
