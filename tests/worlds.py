@@ -115,6 +115,7 @@ class CountingAgent:
     pretrain_windows: int = 5
     cycle_windows: int = 8
     window: ClassVar = WindowShape(3, 6)
+    losses: ClassVar = ()
 
     def init(self, key, spec):
         return CountingState(jnp.zeros(()), jnp.zeros((), int))
