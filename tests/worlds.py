@@ -116,6 +116,7 @@ class CountingAgent:
     cycle_windows: int = 8
     window: ClassVar = WindowShape(3, 6)
     empty: ClassVar = 3.0  # the count before the first: whoever takes zeros for an empty memory counts wrongly
+    losses: ClassVar = ()
 
     def init(self, key, spec):
         return CountingState(jnp.zeros(()), jnp.zeros((), int))

@@ -235,7 +235,10 @@ def test_an_environment_goes_on_from_the_start_of_an_episode(tmp_path):
 
 @pytest.mark.parametrize(
     ("what", "why"),
-    [("networks", "its networks are not finite"), pytest.param("q", "q is not finite", marks=pytest.mark.slow)],
+    [
+        ("networks", "its networks are not finite"),
+        pytest.param("loss_q", "loss_q is not finite", marks=pytest.mark.slow),
+    ],
 )
 def test_a_seed_that_diverges_stops_alone(tmp_path, monkeypatch, what, why):
     """The second seed's networks, or a loss of it, are made NaN after step 120."""

@@ -41,6 +41,11 @@ class Agent(Protocol):
         ...
 
     @property
+    def losses(self) -> tuple[str, ...]:
+        """The metrics that end a seed where they are not finite; `pretrain` and the updates share these names."""
+        ...
+
+    @property
     def pretrain_windows(self) -> int:
         """How many of them `pretrain` is given."""
         ...

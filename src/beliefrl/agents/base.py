@@ -90,6 +90,11 @@ class SACAgent:
         raise NotImplementedError
 
     @property
+    def losses(self) -> tuple[str, ...]:
+        """The metrics that end a seed where they are not finite."""
+        return "loss_value", "loss_q", "loss_actor"
+
+    @property
     def optimisers(self) -> Optimisers:
         return Optimisers(optax.adam(self.lr_actor), optax.adam(self.lr_critic), optax.adam(self.lr_alpha))
 

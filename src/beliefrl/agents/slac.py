@@ -94,6 +94,10 @@ class SLACAgent(SACAgent):
         return WindowShape(self.history - 1, self.seq_len)
 
     @property
+    def losses(self) -> tuple[str, ...]:
+        return *super().losses, "negative_elbo"
+
+    @property
     def pretrain_windows(self) -> int:
         return self.batch_size
 

@@ -143,6 +143,10 @@ class VRMAgent(SACAgent):
         return WindowShape(self.burn_in, self.seq_len)
 
     @property
+    def losses(self) -> tuple[str, ...]:
+        return *super().losses, "negative_elbo", "prediction_error"
+
+    @property
     def pretrain_windows(self) -> int:
         return self.batch_size
 

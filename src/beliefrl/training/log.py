@@ -39,9 +39,9 @@ def record(recorder: Recorder, event: Event, has_success: bool, lost: Collection
         if index in lost:
             continue
         if metrics and event.part:
-            recorder.log(seed, "pretrain", event.part[0], {k: float(v[index]) for k, v in metrics.items()})
+            recorder.log(seed, "pretrain", event.part[0], _row(metrics, index))
         elif metrics:
-            recorder.log(seed, "update", event.step, {k: float(v[index]) for k, v in metrics.items()})
+            recorder.log(seed, "update", event.step, _row(metrics, index))
         if event.episodes is not None:
             episodes = jax.tree.map(lambda leaf, index=index: np.asarray(leaf[index]), event.episodes)
             for end in np.flatnonzero(episodes.done):
@@ -55,6 +55,11 @@ def record(recorder: Recorder, event: Event, has_success: bool, lost: Collection
     if event.evaluation is None:
         return None
     return {"step": event.step} | summary(event.evaluation, has_success)
+
+
+def _row(metrics: dict[str, np.ndarray], index: int) -> dict[str, float]:
+    """The metrics of one seed that are finite: JSON has no other numbers."""
+    return {name: float(values[index]) for name, values in metrics.items() if np.isfinite(values[index])}
 
 
 def _episode(episodes: Episode, end: Any, has_success: bool) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from beliefrl.training import replay as ring
 from beliefrl.training import rollout
 from beliefrl.training.replay import Replay
 from beliefrl.training.rollout import ActorState, Episode
-from beliefrl.types import Spec
+from beliefrl.types import Spec, UserError
 
 Metrics = dict[str, Float[Array, "..."]]
 
@@ -35,7 +35,7 @@ def stretch_length(agent: Agent) -> int:
 
 
 class SeedState(NamedTuple):
-    """All arrays of one training. Mapped over seeds, every leaf has a leading axis `seed`."""
+    """Everything that the training of one seed changes. Mapped over seeds, every leaf has a leading axis `seed`."""
 
     state: Any  # the agent's
     actor: ActorState
@@ -44,7 +44,7 @@ class SeedState(NamedTuple):
 
 
 class Stretch(NamedTuple):
-    """The results of a stretch of steps, of one seed."""
+    """Metrics and episodes of a stretch of steps, of one seed."""
 
     metrics: Metrics  # means over its updates
     episodes: Episode | None  # leaves (stretch,): one entry a step, done only where an episode ended
@@ -122,7 +122,7 @@ def pretrain(
 
 
 def refresh(agent: Agent, spec: Spec, seed: SeedState) -> SeedState:
-    """Perceive again, with the pre-trained networks, everything recorded so far (at most 2 timesteps a step)."""
+    """Recompute the notes and the actor's memory with the pre-trained networks (at most 2 timesteps a step)."""
     length = min(2 * agent.step_start_rl, ring.capacity(seed.replay))
     key = jax.random.fold_in(seed.key, REFRESH)
     actor, replay = rollout.refresh(agent, spec, seed.state, seed.actor, seed.replay, key, length)
@@ -166,7 +166,11 @@ def _cycle(
 
 
 def learn_cycle(agent: Agent, seed: SeedState, first: Int[Array, ""]) -> tuple[Any, Metrics]:
-    """Learn after the steps of the cycle that began at environment step `first`; returns the new state."""
+    """The updates after the steps of the cycle that began at environment step `first`: the new state and metrics.
+
+    Raises:
+        UserError: `begin_cycle` and `update` return a metric of the same name.
+    """
     windows = ring.sample(seed.replay, step_key(seed.key, first, SAMPLE), agent.cycle_windows, agent.window)
     state, batches, model_metrics = agent.begin_cycle(seed.state, windows, step_key(seed.key, first, CYCLE))
 
@@ -179,6 +183,8 @@ def learn_cycle(agent: Agent, seed: SeedState, first: Int[Array, ""]) -> tuple[A
 
     updates = jnp.arange(count)
     state, metrics = jax.lax.scan(update, state, (updates, batches))
+    for name in model_metrics.keys() & metrics.keys():
+        raise UserError(f"begin_cycle and update of the agent both return a metric {name!r}: rename one of them.")
     return state, model_metrics | jax.tree.map(jnp.mean, metrics)
 
 

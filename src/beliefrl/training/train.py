@@ -228,7 +228,10 @@ class _Training:
 
     def _look_for_divergence(self, event: Event) -> None:
         """Drop seeds whose losses or networks are no longer finite; the others go on."""
-        for name, values in event.metrics.items():
+        losses = {
+            name: event.metrics[name] for name in event.metrics if name.removeprefix("pretrain_") in self.agent.losses
+        }
+        for name, values in losses.items():
             self._lose(np.flatnonzero(~np.isfinite(values)), event, f"{name} is not finite")
         states = event.states
         if event.snapshot is not None and self._is_due(event.snapshot):
