@@ -46,7 +46,7 @@ MISTAKES = {
     f"{TRAIN} --n-step 65": "n_step=65 is impossible",
     f"{TRAIN} --updates-per-step 0": "updates_per_step=0 is impossible",
     f"{TRAIN} --value-start inf": "value_start=inf is impossible",
-    f"{TRAIN} --windows all": "--windows must be one of 'stream', 'episode', not 'all'",
+    f"{TRAIN} --models all": "--models must be one of 'both', 'single', 'first', 'keep', not 'all'",
     "train slac pendulum-v --history 0": "history=0 is impossible",
     "train sac-lstm pendulum-v --burn-in -1": "burn_in=-1 is impossible",
     "train sac-mlp pendulum-v --seq-len 4": "There is no option --seq-len",

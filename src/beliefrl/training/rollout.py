@@ -156,7 +156,7 @@ def refresh(
 
     memory, notes = jax.lax.scan(perceive, empty, (steps, exists, jax.random.split(key, length)))
     memory = jax.tree.map(lambda old, new: jnp.where(actor.step.is_first, old, new), empty, memory)
-    return actor._replace(memory=memory), ring.annotate(replay, notes, length)
+    return _strong(actor._replace(memory=memory)), ring.annotate(replay, notes, length)
 
 
 def evaluate(agent: Agent, task: Task, state: Any, key: Key[Array, ""], explore: Bool[Array, " episodes"]) -> Episode:
