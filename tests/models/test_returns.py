@@ -115,5 +115,5 @@ def test_targets_grow_with_the_steps_of_the_return():
     for n in (1, 5):
         agent = agents.make("sac-mlp", n_step=n, batch_size=8)
         window = windows(jax.random.key(1), 8, n + 1)
-        batch = agent.batch(window._replace(step=window.step._replace(reward=jnp.ones((8, n + 1)))))
+        batch = agent.batch(window._replace(step=window.step._replace(reward=jnp.ones((n + 1, 8)))))
         np.testing.assert_allclose(batch.reward, (1 - agent.gamma**n) / (1 - agent.gamma), rtol=1e-5)
