@@ -8,6 +8,7 @@ import tempfile
 # the programs that they start; a folder for each of pytest's processes, as JAX does not write its files in one piece.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="beliefrl-compiled-")
+os.environ["BELIEFRL_CACHE"] = "off"  # nothing is written to the user's cache folder
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
 os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
 

@@ -193,7 +193,7 @@ def test_a_config_that_is_no_json_is_refused(tmp_path, content):
         {"processes": "some"},
     ],
 )
-def test_options_outside_their_range_are_refused_with_the_file_and_the_name(tmp_path, options):
+def test_options_outside_their_range_are_refused_with_the_file_and_the_name(tmp_path, options, unchecked):
     (tmp_path / "config.json").write_text(json.dumps(CONFIG | {"options": CONFIG["options"] | options}))
     with pytest.raises(UserError, match=rf"config.json cannot be used: {next(iter(options))}=.* is impossible"):
         Run(tmp_path)

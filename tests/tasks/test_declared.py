@@ -37,7 +37,7 @@ def test_a_task_that_says_so_has_versions_with_a_part_of_the_observation(package
         assert tasks.describe(task)["task"] == name
         assert tasks.knows(name)
     assert tasks.make("masked", observe="velocities") == tasks.make("masked-v")
-    with pytest.raises(UserError, match="counts does not say which of its observations are velocities"):
+    with pytest.raises(UserError, match="counts does not define which entries are velocities"):
         tasks.make("counts-v")
 
 

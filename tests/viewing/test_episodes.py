@@ -99,7 +99,7 @@ class Grey(Counter):
     [
         (GymnasiumTask(Blind), r"Blind cannot be rendered: give it a render_mode='rgb_array' \(.*TypeError"),
         (GymnasiumTask(Broken), "Broken cannot be rendered here: RuntimeError: no screen"),
-        (GymnasiumTask(Grey), r"Grey renders float64 of shape \(20, 30\), where rgb_array is uint8"),
+        (GymnasiumTask(Grey), r"Grey renders float64 of shape \(20, 30\), but rgb_array must be uint8"),
         (Counting(), "Counting cannot be rendered: give it a method draw"),
     ],
 )
