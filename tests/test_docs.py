@@ -7,6 +7,7 @@ import io
 import json
 import pathlib
 import re
+import runpy
 
 import pytest
 
@@ -151,3 +152,8 @@ def test_every_public_name_is_in_the_api():
 def test_every_example_is_shown():
     shown = re.findall(r"{literalinclude} \.\./examples/(\S+)", (DOCS / "examples.md").read_text())
     assert sorted(shown) == sorted(path.name for path in (ROOT / "examples").glob("*.py"))
+
+
+def test_the_picture_of_the_rooms_is_drawn_from_the_imports():
+    house = runpy.run_path(str(DOCS / "house.py"))
+    assert house["PICTURE"].read_text() == house["draw"](house["read"]())
