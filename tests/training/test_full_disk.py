@@ -37,7 +37,9 @@ Recorder("run", None).close()  # it is locked no more
 """
 
 
-@pytest.mark.parametrize("file", FILES)
+@pytest.mark.parametrize(
+    "file", ["metrics", *(pytest.param(name, marks=pytest.mark.slow) for name in FILES if name != "metrics")]
+)
 def test_a_disk_that_is_full_is_one_sentence(tmp_path, file):
     command = [sys.executable, "-c", LIMITED, FILES[file]]
     environment = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
