@@ -114,6 +114,18 @@ def test_a_sweep_that_is_stopped_says_how_to_go_on(tmp_path):
     assert len(Pretence.started) == 4
 
 
+def test_trainings_that_finish_while_they_are_stopped_count_as_finished(tmp_path, monkeypatch):
+    def finish_all(self):
+        for training in self.running.values():
+            self.finish(training)
+        self.running = {}
+
+    monkeypatch.setattr(Pretence, "ended", lambda self: {})
+    monkeypatch.setattr(Pretence, "stop", finish_all)
+    with pytest.raises(Stopped, match=r"stopped with 2 of 4 trainings finished"):
+        sweep(TWO, tmp_path, workers=2, report=lambda status: os.kill(os.getpid(), signal.SIGINT))
+
+
 def test_two_processes_cannot_run_one_sweep(tmp_path):
     def again(status):
         with pytest.raises(UserError, match="is being swept by process"):

@@ -126,7 +126,8 @@ def _loop(folder: pathlib.Path, status: SweepStatus, launcher: Launcher, report:
         report(status)
         if requests.number:
             launcher.stop()
-            done = f"{len(status.finished)} of {status.count}"
+            finished = status.finished + [each for each in status.running.values() if each.is_finished(folder)]
+            done = f"{len(finished)} of {status.count}"  # some finish while they are asked to stop
             raise Stopped(
                 f"stopped with {done} trainings finished; `beliefrl sweep --out {folder}` continues.", requests.number
             )
