@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from beliefrl import agents, tasks
-from beliefrl.training import phases
+from beliefrl.runs.options import Options
+from beliefrl.training import phases, schedule
 from small import MODELS, SEQUENCES, SHARED, leaves, trained
 from worlds import Counting, CountingAgent
 
@@ -145,3 +146,18 @@ def test_evaluation_leaves_training_alone_and_separates_modes():
     result = program.evaluate(program.begin(keys).state, keys)
     assert result.episode_return.shape == (2, 2, 3)
     np.testing.assert_array_equal(result.episode_return, 10)
+
+
+@pytest.mark.parametrize(
+    ("steps", "limit", "expected"),
+    [
+        (1_000_000, 1_000_000, 1_000_000),
+        (400_000, 1_000_000, 500_000),  # room for 1.25 timesteps a step
+        (1_000, 1_000_000, 2_000),  # the exploration always fits, with episodes of one step too
+        (600, 1_000_000, 1_200),  # no more than can come
+        (400_000, 5_000, 5_000),
+    ],
+)
+def test_the_replay_has_room_for_a_training_and_little_more(steps, limit, expected):
+    options = Options(steps=steps, replay_capacity=limit)
+    assert schedule.capacity(agents.make("sac-mlp"), options) == expected

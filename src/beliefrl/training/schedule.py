@@ -183,15 +183,21 @@ def _stages(
         yield Event(Phase.FINISHED, at.step, snapshot=Snapshot(at._replace(evaluated=at.step), seeds))
 
 
+ROOM = 1.25  # timesteps in the replay for each step: with episodes of 4 steps and more it holds the whole training
+
+
 def capacity(agent: Agent, options: Options) -> int:
-    """Timesteps in a seed's replay: no more than can come, one per step and one more where an episode ends."""
-    if options.steps > agent.step_start_rl:
-        needed = max(2 * agent.step_start_rl, agent.window.length + 1)  # `refresh` wants all of the exploration
-        if options.replay_capacity < needed:
-            raise UserError(
-                f"replay_capacity={options.replay_capacity} is too small: this agent needs at least {needed}."
-            )
-    return min(options.replay_capacity, 2 * options.steps)
+    """Timesteps in a seed's replay: one for each step, and room for those that end episodes.
+
+    Where episodes are shorter than 4 steps on average, the oldest timesteps are replaced before the training ends.
+
+    Raises:
+        UserError: `replay_capacity` has no room for the exploration, or for a window.
+    """
+    needed = max(2 * agent.step_start_rl, agent.window.length + 1)  # `refresh` wants all of the exploration
+    if options.steps > agent.step_start_rl and options.replay_capacity < needed:
+        raise UserError(f"replay_capacity={options.replay_capacity} is too small: this agent needs at least {needed}.")
+    return min(options.replay_capacity, max(int(ROOM * options.steps), min(needed, 2 * options.steps)))
 
 
 def _until(step: int, every: int) -> int:
