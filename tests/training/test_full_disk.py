@@ -44,6 +44,6 @@ def test_a_disk_that_is_full_is_one_sentence(tmp_path, file):
     command = [sys.executable, "-c", LIMITED, FILES[file]]
     environment = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
-    assert "cannot be written (File too large): fix the cause, then `beliefrl resume run` continues." in done.stderr
+    assert "cannot be written (File too large): fix that, then `beliefrl resume run` goes on." in done.stderr
     assert done.stderr.count("\n") == 1
     assert done.returncode == 0

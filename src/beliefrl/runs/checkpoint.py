@@ -98,8 +98,8 @@ class Checkpoints:
             writing.result()
         except OSError as error:
             raise UserError(
-                f"The checkpoint in {self.folder} cannot be written ({error.strerror}): fix the cause, "
-                f"then `beliefrl resume {self.folder.parent}` continues."
+                f"The checkpoint in {self.folder} cannot be written ({error.strerror}): fix that, then "
+                f"`beliefrl resume {self.folder.parent}` goes on."
             ) from None
 
     def close(self) -> None:
