@@ -1,9 +1,9 @@
-"""What checkpoints cost: a training with one every 2,000 steps beside one without, at velocities-only Hopper's sizes.
+"""Measure the cost of a checkpoint every 2,000 steps, at the sizes of velocities-only Hopper.
 
     python benchmarks/checkpoint.py            # about ten minutes
 
-The replay has room for 100,000 steps. Stretches with and without a checkpoint alternate; the time of one is all that
-the training waits for it and all that its writing slows down.
+Stretches of 2,000 steps with and without a checkpoint alternate. The difference of their times includes the time that
+the training waits for a checkpoint, and the slowdown while a thread writes it.
 """
 
 import pathlib
@@ -22,7 +22,7 @@ from beliefrl.training.bench import Noise
 
 
 def main(name: str = "vrm", steps: int = 2_000, capacity: int = 200_000, rounds: int = 3) -> None:
-    """Time `rounds` times `steps` steps of the agent with, and without, a checkpoint at their beginning."""
+    """Time `steps` steps of the agent, `rounds` times with a checkpoint at their start and `rounds` times without."""
     agent, every = agents.make(name), 100
     program = phases.compile_program(agent, Noise(6, 3), capacity, 1)
     seeds = program.begin(jax.random.split(jax.random.key(0), 1))
@@ -43,7 +43,7 @@ def main(name: str = "vrm", steps: int = 2_000, capacity: int = 200_000, rounds:
                 waited.append(time.perf_counter() - before)
             for step in range(first, first + steps, every):
                 seeds = jax.block_until_ready(program.learn(seeds, step, every // agent.cycle)[0])
-            if number > 1:  # the first checkpoint writes all that came before
+            if number > 1:  # the first checkpoint writes all earlier timesteps
                 times[number % 2].append(time.perf_counter() - before)
         checkpoints.close()
         size = sum(path.stat().st_size for path in pathlib.Path(folder).rglob("*") if path.is_file())

@@ -1,9 +1,9 @@
-"""What it costs that an environment runs on the host: the host loop beside the compiled loop, environment time apart.
+"""Compare the time of a step of the host loop and of the compiled loop, without the time of the environment.
 
     python benchmarks/host_loop.py            # vrm, sac-mlp, sac-lstm, slac at Hopper's sizes
 
-Both train the same agent on noise of the same sizes, a stretch of steps each in turn. The environment measures the time
-that passes inside of it, which is taken off. Prints medians in milliseconds a step, and the ratio.
+Both train the same agent on random observations of the same sizes, in turn. The environment measures the time of its
+own steps, which is subtracted. Prints medians in milliseconds per step, and their ratio.
 """
 
 import statistics
@@ -22,7 +22,7 @@ from beliefrl.training.bench import Noise
 
 
 class NoiseEnvironment(gymnasium.Env):
-    """Numbers of a given size, and the time they took."""
+    """Random observations of a given size. `spent` is the time of all steps in seconds."""
 
     spent = 0.0
 
@@ -49,10 +49,10 @@ def main(
     rounds: int = 9,
 ) -> None:
     """Time the agents `names` with observations and actions of these sizes."""
-    host_loop.keep_memory()  # as the command line has it
+    host_loop.keep_memory()  # as on the command line
     environment = GymnasiumTask(NoiseEnvironment, "noise", {"obs": obs, "actions": actions}, max_steps=1000)
     keys = jax.random.split(jax.random.key(0), seeds)
-    print(f"{'agent':<10}{'compiled':>10}{'host':>10}{'ratio':>8}   ms a step, environment apart; {seeds} seeds")
+    print(f"{'agent':<10}{'compiled':>10}{'host':>10}{'ratio':>8}   ms/step without the environment; {seeds} seeds")
     for name in names:
         agent = agents.make(name)
         stretch = phases.stretch_length(agent)

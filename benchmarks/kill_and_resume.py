@@ -1,9 +1,9 @@
-"""Kill a training 50 times at random moments, some while a checkpoint is being written, and resume it each time.
+"""Kill a training 50 times at random times, half of them while a checkpoint is being written, and resume it each time.
 
     python benchmarks/kill_and_resume.py            # about ten minutes
 
-SIGKILL, from outside, as the machine dies. In the end the metrics and the networks must be, byte for byte, those of a
-training that nothing happened to. A training that ends before it was killed often enough is compared, and begun anew.
+The signal is SIGKILL. At the end, the metrics and the networks must be byte-identical to those of an uninterrupted
+training. If a training ends before the last kill, it is compared, and a new training starts.
 """
 
 import os
@@ -35,18 +35,18 @@ def command(*words: str) -> list[str]:
 
 
 def training(folder: pathlib.Path) -> list[str]:
-    """The command that begins it."""
+    """The command that starts the training."""
     options = [word for name, value in SETTINGS.items() for word in (f"--{name}", str(value))]
     return command("train", "sac-mlp", "pendulum-v", *options, "--out", str(folder))
 
 
 def is_writing(folder: pathlib.Path) -> bool:
-    """Whether a checkpoint is on its way to the disk."""
+    """Whether a checkpoint is being written."""
     return any(folder.glob("checkpoints/.*.tmp")) or any(folder.glob("checkpoints/replay/.*.tmp"))
 
 
 def killed(arguments: list[str], folder: pathlib.Path, in_writing: bool, seconds: float) -> bool | None:
-    """Run and kill; returns whether that was in the middle of writing, or None if it ended by itself before."""
+    """Run and kill; returns whether a checkpoint was being written, or None if the training had already ended."""
     newest = max(folder.glob("checkpoints/0*"), default=None)
     with subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
         while process.poll() is None and max(folder.glob("checkpoints/0*"), default=None) == newest:
@@ -58,7 +58,7 @@ def killed(arguments: list[str], folder: pathlib.Path, in_writing: bool, seconds
         if process.poll() is not None:
             _, err = process.communicate()
             if process.returncode:
-                raise SystemExit(f"it failed by itself: {err.decode()}")
+                raise SystemExit(f"the training failed: {err.decode()}")
             return None
         process.kill()
         process.wait()
@@ -66,14 +66,14 @@ def killed(arguments: list[str], folder: pathlib.Path, in_writing: bool, seconds
 
 
 def learned(folder: pathlib.Path) -> dict[str, bytes]:
-    """What must be equal: logs, networks, results."""
+    """The files that must be equal: logs, networks, results."""
     paths = [*sorted((folder / "metrics").iterdir()), folder / "agent.safetensors", folder / "results.json"]
     return {path.name: path.read_bytes() for path in paths}
 
 
 def main(kills: int = 50, seed: int = 0) -> None:
-    """Kill `kills` times; `seed` is of the moments."""
-    moments, folder = random.Random(seed), pathlib.Path(tempfile.mkdtemp())
+    """Kill `kills` times, at random times that follow from `seed`."""
+    times, folder = random.Random(seed), pathlib.Path(tempfile.mkdtemp())
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder / "compiled")
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
     reference, run = folder / "whole", folder / "run"
@@ -85,18 +85,18 @@ def main(kills: int = 50, seed: int = 0) -> None:
             subprocess.run(arguments, check=True, stdout=subprocess.DEVNULL)
             found = None
         else:
-            found = killed(arguments, run, in_writing=done % 2 == 1, seconds=moments.uniform(0, 0.6))
+            found = killed(arguments, run, in_writing=done % 2 == 1, seconds=times.uniform(0, 0.6))
         if found is None:
             finished += 1
             if learned(run) != expected:
-                raise SystemExit(f"training {finished} differs from the one that was left alone: see {folder}")
-            print(f"{done} kills: training {finished} is equal to the one that was left alone", flush=True)
+                raise SystemExit(f"training {finished} differs from the uninterrupted one: see {folder}")
+            print(f"{done} kills: training {finished} is equal to the uninterrupted one", flush=True)
             shutil.rmtree(run)
             arguments = training(run) if done < kills else None
             continue
         done, writing = done + 1, writing + found
         arguments = command("resume", str(run))
-    print(f"{done} kills, {writing} of them in the middle of writing; {finished} trainings, all equal byte for byte")
+    print(f"{done} kills, {writing} of them while a checkpoint was written; {finished} trainings, all byte-identical")
     shutil.rmtree(folder)
 
 

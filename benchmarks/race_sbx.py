@@ -1,8 +1,8 @@
-"""SAC-MLP raced against SBX's SAC: updates per second of both on Pendulum, in turn, on this machine.
+"""Compare the speed of SAC-MLP and SBX's SAC: updates per second of both on Pendulum, in turn, on this machine.
 
-The same sizes (two hidden layers of 256, batches of 256, one update a step, Adam at 3e-4); what each calls SAC differs:
-ours has V and its target and separate networks for μ and log σ, SBX has two target Qs and one network for both. Ours
-steps a Pendulum in JAX inside the compiled program, SBX Gymnasium's in Python; both times include stepping.
+Both have two hidden layers of 256, batches of 256, one update per step, and Adam with a rate of 3e-4. The algorithms
+differ: ours has V, its target, and separate networks for μ and log σ; SBX has two target Qs, and one network for both.
+Our Pendulum is a part of the compiled program; SBX steps Gymnasium's in Python. Both times include stepping.
 
     python -m venv /tmp/sbx && /tmp/sbx/bin/pip install torch==2.13.0 "sbx-rl==0.28.*"
     python benchmarks/race_sbx.py /tmp/sbx/bin/python
@@ -59,12 +59,12 @@ def theirs() -> float:
 
 
 def main(peer: str) -> None:
-    """Race `ROUNDS` times in turn, each in a process of its own, and print medians."""
+    """Measure both `ROUNDS` times in turn, each in a process of its own, and print medians."""
     rates = {"ours": [], "theirs": []}
     for number in range(ROUNDS):
         for who, python in (("ours", sys.executable), ("theirs", peer)):
-            told = subprocess.run([python, __file__, "--run", who], capture_output=True, text=True, check=True).stdout
-            rates[who].append(float(told.split()[-1]))
+            output = subprocess.run([python, __file__, "--run", who], capture_output=True, text=True, check=True).stdout
+            rates[who].append(float(output.split()[-1]))
         print(
             f"round {number + 1}: beliefrl {rates['ours'][-1]:.0f}, SBX {rates['theirs'][-1]:.0f} updates/s", flush=True
         )

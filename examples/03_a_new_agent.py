@@ -1,14 +1,14 @@
-"""A new agent: soft actor-critic on the last few observations, the plain answer to a hidden velocity.
+"""A new agent: soft actor-critic on the last few observations, which determine a hidden velocity.
 
     pip install beliefrl
     python examples/03_a_new_agent.py                  # 6,000 steps on the pendulum without its speed: a few minutes
-    python examples/03_a_new_agent.py --steps 300      # to see it run
+    python examples/03_a_new_agent.py --steps 300      # a short test run
 
-By then two seeds came to -750 and -495; random play gets about -1200.
+After 6,000 steps two seeds have returns of -750 and -495. A random policy gets about -1200.
 
-An agent is a frozen dataclass of hyperparameters whose methods are pure functions, for one seed and one actor; the
-training loop maps them over seeds and environments. `SACAgent` has Table 1 of the paper and the controller; an
-agent adds its memory while acting, the windows of the past that it learns from, and how beliefs are formed of both.
+An agent is a frozen dataclass of hyperparameters whose methods are pure functions, for one seed and one actor. The
+training loop maps them over seeds and environments. `SACAgent` has the hyperparameters of Table 1 of the paper, and the
+controller. An agent adds its memory in acting, the windows that it learns from, and how beliefs are formed from both.
 """
 
 import dataclasses
@@ -34,18 +34,18 @@ class State(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class StackAgent(SACAgent):
-    """Soft actor-critic on the last `stack` observations; before an episode's first, on copies of it."""
+    """Soft actor-critic on the last `stack` observations. At the start of an episode the first one is repeated."""
 
     stack: int = 3
-    """Observations that the controller reads."""
+    """Number of observations that the controller reads."""
     batch_size: int = 256
-    """Transitions in an update."""
+    """Transitions in each update."""
     pretrain_updates: int = 5000
-    """Updates at step_start_rl, as many as the paper's agents make."""
+    """Updates after step_start_rl steps, as many as for the paper's agents."""
 
     @property
     def window(self) -> WindowShape:
-        """A transition of `n_step` steps, and what must be seen before it."""
+        """A transition of `n_step` steps, and the timesteps before it that its stack needs."""
         return WindowShape(burn_in=self.stack - 1, length=self.n_step)
 
     @property
@@ -67,7 +67,7 @@ class StackAgent(SACAgent):
         return state._replace(optimiser=())
 
     def reset(self, spec: Spec) -> Float[Array, "stack obs"]:
-        """The memory of an actor before its first moment."""
+        """The memory of an actor before its first timestep."""
         return jnp.zeros((self.stack, spec.obs_dim))
 
     def act(
@@ -78,17 +78,17 @@ class StackAgent(SACAgent):
         key: Key[Array, ""],
         explore: Bool[Array, ""],
     ) -> tuple[Float[Array, " action"], Float[Array, "stack obs"]]:
-        """Perceive a moment, and act on it."""
+        """Perceive a timestep, and choose an action."""
         older = jnp.where(step.is_first, jnp.broadcast_to(step.obs, memory.shape), memory)
         memory = jnp.concatenate([older[1:], step.obs[None]])
         return self.choose(state.controller, memory.reshape(-1), key, explore), memory
 
     def note(self, memory: Float[Array, "stack obs"]) -> tuple[()]:
-        """What the replay keeps beside the moment: nothing."""
+        """What the replay stores with the timestep: nothing."""
         return ()
 
     def stacks(self, windows: Window) -> Float[Array, "time batch belief"]:
-        """The beliefs at every moment of windows, by the same memory as in acting."""
+        """The beliefs at every timestep of the windows, from the same memory as in acting."""
         begins = windows.step.is_first | ~windows.exists
 
         def perceive(memory, moment):
@@ -120,7 +120,7 @@ class StackAgent(SACAgent):
 
 
 def main(steps: int = 6_000, seeds: int = 2, out: str = "runs/stack") -> None:
-    """Train it on the pendulum of which the angle is seen and the speed is not."""
+    """Train on the pendulum whose angle is observed and whose velocity is hidden."""
     run = beliefrl.train(StackAgent(), "pendulum-p", out, steps=steps, seeds=seeds)
     for seed in run.seeds:
         means = {row["step"]: round(sum(row["sampled"]) / len(row["sampled"])) for row in run.rows(seed, "evaluation")}
@@ -130,7 +130,7 @@ def main(steps: int = 6_000, seeds: int = 2, out: str = "runs/stack") -> None:
 if __name__ == "__main__":
     tyro.cli(main)
 
-# The command line takes it as well, in the folder of this file. Its fields are options.
+# The command line accepts this agent too, in the folder of this file. Its fields are options.
 #
 #     beliefrl train 03_a_new_agent:StackAgent pendulum-p --stack 4 --steps 6000 --out runs/stack-4
 #     beliefrl resume runs/stack-4 --steps 10000 --agent 03_a_new_agent:StackAgent

@@ -1,7 +1,8 @@
-"""Keep what runs have measured: `python benchmarks/results/keep.py results/NAME.json.gz RUNS ...`.
+"""Write the results of runs to a file: `python benchmarks/results/keep.py results/NAME.json.gz RUNS ...`.
 
-RUNS are runs, finished or not, folders that hold runs, or other files of results. What is in the file already stays; a
-run that is packed again, as it has gone on since, takes its old place. What is kept: `beliefrl.analysis.results`.
+RUNS are runs, finished or not, folders that contain runs, or other files of results. Runs that are already in the file
+stay there. If a run is given again, for example after more steps, it replaces its earlier version. The format of the
+file is described in `beliefrl.analysis.results`.
 """
 
 import pathlib

@@ -194,9 +194,9 @@ def test_without_a_good_one_there_is_a_sentence(three):
     folder, _ = three
     for path in checkpoint.listed(folder):
         cut(path / "state.safetensors")
-    with pytest.raises(UserError, match=r"has no checkpoint to go on from: .*state\.safetensors is damaged"):
+    with pytest.raises(UserError, match=r"has no checkpoint to continue from: .*state\.safetensors is damaged"):
         restored(folder)
-    with pytest.raises(UserError, match="has no checkpoint to go on from"):
+    with pytest.raises(UserError, match="has no checkpoint to continue from"):
         restored(folder / "nothing")
 
 

@@ -171,7 +171,7 @@ def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
 )
 def test_a_config_that_no_training_wrote_is_refused(tmp_path, config):
     (tmp_path / "config.json").write_text(json.dumps(config))
-    with pytest.raises(UserError, match="lacks what"):
+    with pytest.raises(UserError, match="lacks entries that every training writes"):
         Run(tmp_path)
 
 

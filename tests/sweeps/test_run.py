@@ -128,7 +128,7 @@ def test_trainings_that_finish_while_they_are_stopped_count_as_finished(tmp_path
 
 def test_two_processes_cannot_run_one_sweep(tmp_path):
     def again(status):
-        with pytest.raises(UserError, match="is being swept by process"):
+        with pytest.raises(UserError, match="is in use by process"):
             sweep(TWO, tmp_path)
 
     sweep(TWO, tmp_path, report=again)

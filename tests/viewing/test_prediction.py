@@ -173,7 +173,7 @@ def test_a_short_episode_is_seen_to_its_half(tmp_path):
         ("sac-lstm", {}, "is a run of sac-lstm, which has no model"),
         ("vrm-keep", {"model": "first"}, "vrm-keep has no model 'first': it has keep"),
         ("slac", {"model": "keep"}, "slac has no model 'keep': it has latent"),
-        ("slac", {"start": 13}, "start=13 is impossible: the episode has 13 time steps, so give 12 or less"),
+        ("slac", {"start": 13}, "start=13 is impossible: the episode has 13 timesteps, so give 12 or less"),
     ],
 )
 def test_what_cannot_be_predicted_is_told_in_a_sentence(tmp_path, name, changes, sentence):

@@ -12,7 +12,7 @@ from beliefrl.analysis.panels import counts
 from beliefrl.analysis.scalability import hours, wall_clock
 from beliefrl.analysis.tables import Column, write_table
 
-SOLVED = 0.95  # a score of `aggregate`: a return of -203 on the pendulum, 951 on CartPole, 133 in target reaching
+SOLVED = 0.95  # score (`aggregate`): a return of -203 on the pendulum, 951 on CartPole, 133 on target reaching
 
 COLUMNS = (
     Column("task"),
@@ -22,7 +22,7 @@ COLUMNS = (
     Column("sampled actions", True),
     Column("mode actions", True),
     Column("solved at", True),
-    Column("wall-clock a seed", True),
+    Column("wall-clock per seed", True),
 )
 
 
@@ -65,7 +65,7 @@ def _rate(group: Group, name: str) -> str:
 
 
 def _solved(task: str, *curves: Curve) -> str:
-    """The first step at which the mean of one of the curves is high enough; "-" for a task without known bounds."""
+    """The first step at which the mean of one of the curves is solved; "-" for a task without known bounds."""
     known = known_bounds(task)
     if known is None:
         return "-"

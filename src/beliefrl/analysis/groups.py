@@ -63,7 +63,7 @@ class FoundRuns(NamedTuple):
     """The runs in some folders, and the damage that was found there."""
 
     runs: list[Run]
-    damage: list[str]  # one sentence for each unreadable run, and for each log with damaged lines
+    damage: list[str]  # one sentence for each unreadable run and for each log with damaged lines
 
 
 def find(paths: Sequence[str | os.PathLike[str]], read: Callable[[pathlib.Path], Run] = Run) -> FoundRuns:
@@ -148,7 +148,7 @@ def _precedence(run: Run, seed: int) -> tuple[int, str]:
 
 
 def task_of(run: Run) -> str:
-    """The name of a task in figures: with the observed entries, if the task's own name does not say them."""
+    """The name of a task in figures. It includes the observed entries, if the run has selected some."""
     seen = run.config.get("observe")
     return run.config["task"] + (f" observe {' '.join(map(str, seen))}" if seen else "")
 

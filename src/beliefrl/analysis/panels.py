@@ -20,7 +20,7 @@ DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (7, 2, 1.5, 2)), (0, (3, 1, 1, 
 
 
 def draw_curves(groups: Sequence[Group], out: pathlib.Path, mode: str = "sampled") -> pathlib.Path:
-    """Draw returns over environment steps, mean and S.E.M. over seeds. Tasks with success get a panel for its rate.
+    """Draw returns over environment steps, mean and S.E.M. over seeds. A task with success has another panel for it.
 
     Args:
         groups: the lines; groups of the same task share a panel.
@@ -146,7 +146,7 @@ def add_legend(made: Any, colour: dict[str, str], title: str, style: dict[str, A
 
 
 def spread(groups: Sequence[Group]) -> str:
-    """The legend's title: how many seeds the lines are a mean of."""
+    """The legend's title: the number of seeds in the means."""
     seeds = {len(group.seeds) for group in groups}
     return "1 seed each" if seeds == {1} else f"mean and S.E.M. of {counts(seeds)} seeds"
 

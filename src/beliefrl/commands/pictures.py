@@ -21,9 +21,9 @@ class PredictOptions:
     model: str | None = None
     """The model to use: keep or first for vrm, latent for slac. None: the first of these that the agent has."""
     start: int | None = None
-    """Number of time steps that the closed loop observes. None: 50, or half of a shorter episode."""
+    """Number of timesteps that the closed loop observes. None: 50, or half of a shorter episode."""
     horizon: int = 100
-    """Number of time steps that the closed loop predicts after that, at most to the end of the episode."""
+    """Number of timesteps that the closed loop predicts after that, at most to the end of the episode."""
     samples: int = 32
     """Number of samples in the mean of each prediction."""
     entries: tuple[int, ...] = ()
@@ -48,7 +48,7 @@ class VideoOptions:
     episodes: int = 1
     """Number of episodes, shown one after the other."""
     fps: float | None = None
-    """Time steps per second of the video. None: real time, with at most 50 frames per second."""
+    """Timesteps per second of the video. None: real time, with at most 50 frames per second."""
     steps: int | None = None
     """Stop each episode after this many steps. None: play until the task ends it."""
     seed: int | None = None

@@ -58,7 +58,7 @@ def show(argv: Sequence[str]) -> None:
     from beliefrl.training.evaluation import agent_of
 
     run, console = Run(options.run), Console()
-    agent = None if is_own(run.config["agent"]) else agent_of(run)  # a user's is not needed to show what is recorded
+    agent = None if is_own(run.config["agent"]) else agent_of(run)  # a user's own class is not needed
     table, results = run_table(run, agent), run.results()
     console.print(table)
     if results:

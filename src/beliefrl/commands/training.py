@@ -14,12 +14,12 @@ from beliefrl.commands.arguments import OwnAgent, agent_name, agent_options, nam
 
 @dataclasses.dataclass(frozen=True)
 class ResumeOptions:
-    """Go on with a training from its last checkpoint; from step 0 where it has none yet."""
+    """Continue a training from its last checkpoint, or from step 0 if it has no checkpoint yet."""
 
     run: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
     steps: int | None = None
-    """Train for so many environment steps in all; None: as many as before. They may only grow."""
+    """Total number of environment steps of each seed, at least as many as before. None: as many as before."""
     agent: OwnAgent = None
 
 
@@ -49,7 +49,7 @@ def train(argv: Sequence[str]) -> None:
                     tyro.conf.arg(
                         metavar="ENTRIES",
                         help="Entries of the observation that the agent sees: indices, or `velocities` or `positions` "
-                        "where the task says which they are. None given: all.",
+                        "if the task defines them. None: all.",
                     ),
                 ],
                 (),
@@ -59,21 +59,25 @@ def train(argv: Sequence[str]) -> None:
                     tuple[str, ...],
                     tyro.conf.arg(
                         metavar="NAME=VALUE",
-                        help="Of a task's physics, or of a Gymnasium environment, such as max_episode_steps=500.",
+                        help="Constants of a task's physics, or arguments of a Gymnasium environment, such as "
+                        "max_episode_steps=500.",
                     ),
                 ],
                 (),
             ),
-            "training": (Annotated[Options, tyro.conf.arg(name="", help="How long, how often.")], Options()),
+            "training": (
+                Annotated[Options, tyro.conf.arg(name="", help="Length and evaluations.")],
+                Options(),
+            ),
             "out": (
                 Annotated[
                     pathlib.Path | None,
-                    tyro.conf.arg(help="The run's folder, a new one. None: runs/AGENT-TASK-1, or the next."),
+                    tyro.conf.arg(help="A new folder for the run. None: runs/AGENT-TASK-1, or the next free number."),
                 ],
                 None,
             ),
             "resume": (
-                Annotated[bool, tyro.conf.arg(help="Go on with the training in --out, if there is one already.")],
+                Annotated[bool, tyro.conf.arg(help="Continue the training in --out, if there is one already.")],
                 False,
             ),
         },
@@ -81,7 +85,7 @@ def train(argv: Sequence[str]) -> None:
     options = parse(options_type, rest, f"beliefrl train {name}")
     task = tasks.make(options.task, options.observe or None, **named_values(options.constants, "--constants"))
     console = Console()
-    if options.resume and options.out is not None and os.path.exists(options.out / "config.json"):  # noqa: PTH110 - pathlib's raises where a name is too long
+    if options.resume and options.out is not None and os.path.exists(options.out / "config.json"):  # noqa: PTH110 - pathlib's version raises if a name is too long
         _same_training(Run(options.out), agents.name_of(options.agent), tasks.describe(task), options)
         _resume(options.out, options.training.steps, type(options.agent) if agents.is_own(name) else None)
         return
@@ -107,7 +111,7 @@ def _ended(run: Any) -> None:
 
 
 def _same_training(run: Any, agent: str, task: dict[str, Any], options: Any) -> None:
-    """Raise a UserError where a run was trained with other settings than the command line gives."""
+    """Raise a UserError if a run was trained with settings that differ from those on the command line."""
     from beliefrl.types import UserError
 
     asked = {"agent": agent, **task, **dataclasses.asdict(options.training), **dataclasses.asdict(options.agent)}

@@ -1,1 +1,1 @@
-"""A run on disk: its folder, log, checkpoints, arrays and trackers. Nothing here knows reinforcement learning."""
+"""A run on disk: its folder, log, checkpoints, arrays and trackers. It imports no reinforcement learning code."""

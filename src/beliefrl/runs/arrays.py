@@ -1,6 +1,6 @@
 """Trees of arrays as files of plain numbers (safetensors), and files that are written atomically.
 
-An array is named by its place in the tree. Random keys are kept as their numbers. Reading a file runs no code.
+The name of an array is its place in the tree. A random key is stored as its numbers. Reading a file runs no code.
 """
 
 import contextlib
@@ -34,11 +34,11 @@ def packed(arrays: dict[str, np.ndarray], about: dict[str, str] | None = None) -
 
 
 def read(path: pathlib.Path, like: Any, renamed: Mapping[str, str] = MappingProxyType({})) -> Any:
-    """A tree of the structure, shapes and types of `like`; `renamed` has the old names of arrays in older files.
+    """A tree of the structure, shapes and types of `like`; `renamed` has the names of arrays in older files.
 
     Raises:
-        Damaged: it cannot be read.
-        UserError: it holds something else.
+        Damaged: the file cannot be read.
+        UserError: an array is missing, or has another shape or type.
     """
     saved = load(path)
     leaves = []
@@ -53,14 +53,14 @@ def read(path: pathlib.Path, like: Any, renamed: Mapping[str, str] = MappingProx
 
 def misfit(path: pathlib.Path, name: str) -> UserError:
     """The error that an array of a file is missing, or of another shape or type."""
-    return UserError(f"{path} does not fit the agent in config.json (at {name}): they are not of one training.")
+    return UserError(f"{path} does not fit the agent in config.json (at {name}): they belong to different trainings.")
 
 
 def load(path: pathlib.Path) -> dict[str, np.ndarray]:
     """The arrays of a file, by name.
 
     Raises:
-        Damaged: it cannot be read.
+        Damaged: the file cannot be read.
     """
     try:
         return safetensors.numpy.load_file(path)
@@ -88,7 +88,7 @@ def write_whole(path: pathlib.Path, content: bytes) -> None:
 
 @contextlib.contextmanager
 def replacing(path: pathlib.Path) -> Iterator[pathlib.Path]:
-    """A temporary name to write a file under; it then replaces `path`, or is removed if writing failed."""
+    """A temporary path for writing a file. The file then replaces `path`, or is removed if writing failed."""
     temporary = path.with_name(f".{path.name}.tmp")
     try:
         yield temporary

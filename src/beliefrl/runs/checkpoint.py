@@ -1,14 +1,14 @@
-"""Checkpoints: the whole state of a training, written atomically. Knows trees of arrays, no reinforcement learning.
+"""Checkpoints: the whole state of a training, written atomically. This file handles trees of arrays only.
 
     checkpoints/
-      000004-step-12000/     appears by one rename, once all of its files are on the disk
+      000004-step-12000/     renamed to this name once all of its files are on the disk
         manifest.json        {"content": {"format", "step", "progress", "files", "replay"}, "sha256": of the content}
         state.safetensors    every array of the training except the replay's timesteps
-      replay/000003.safetensors   the timesteps that were added between two checkpoints; later checkpoints name it too
+      replay/000003.safetensors   the timesteps added between two checkpoints; later checkpoints use it too
 
-A replay only grows at its end, so a checkpoint writes only what is new, and its cost does not grow with the replay. The
-manifest has the size and SHA-256 of each file: a damaged checkpoint is detected, and the one before it is used. Files
-are plain numbers and JSON: reading them runs no code.
+Timesteps are only added at the end of a replay. So a checkpoint writes only the new ones, and its cost does not grow.
+The manifest has the size and SHA-256 of each file: a damaged checkpoint is detected, and the one before it is used.
+Files are plain numbers and JSON: reading them runs no code.
 """
 
 import hashlib
@@ -40,11 +40,11 @@ class Found(NamedTuple):
     progress: dict[str, Any]
     tree: Any
     timesteps: Any  # numpy, leaves (seed, capacity, ...)
-    passed_over: list[str]  # a sentence for each newer one that is damaged
+    passed_over: list[str]  # one sentence for each newer checkpoint, which is damaged
 
 
 class Segment(NamedTuple):
-    """A file with timesteps of every seed, `start` to `stop`, numbered from the first that was ever added."""
+    """A file with timesteps `start` to `stop` of every seed, counted from the first that was ever added."""
 
     file: str
     start: list[int]
@@ -54,27 +54,27 @@ class Segment(NamedTuple):
 
 
 class Checkpoints:
-    """The checkpoints of one run, written by a thread while the training goes on."""
+    """The checkpoints of one run, written by a thread while the training continues."""
 
     def __init__(self, folder: pathlib.Path, keep: int):
-        """In `folder`/checkpoints; the last `keep` are kept."""
+        """The checkpoints are in `folder`/checkpoints. The last `keep` of them are kept."""
         self.folder, self.keep = folder / "checkpoints", keep
         self._segments: list[Segment] = []
         self._thread = ThreadPoolExecutor(1, "checkpoint")
         self._writing: Future[None] | None = None
 
     def save(self, step: int, progress: dict[str, Any], tree: Any, timesteps: Any, added: np.ndarray) -> None:
-        """Copy everything, and begin to write it in the thread.
+        """Copy everything, and start to write it in the thread.
 
         Args:
             step: the environment step, part of the checkpoint's name.
-            progress: what else is needed to go on, of JSON's types.
+            progress: everything else that is needed to continue, as values for JSON.
             tree: all arrays except the timesteps.
             timesteps: leaves (seed, capacity, ...): a ring buffer.
-            added: (seed,), how many timesteps were ever added.
+            added: (seed,), the number of timesteps that were ever added.
 
         Raises:
-            UserError: the checkpoint before this one could not be written.
+            UserError: the previous checkpoint could not be written.
         """
         self.wait()
         state, new = arrays.copied(tree), self._new_timesteps(timesteps, added)
@@ -119,7 +119,7 @@ class Checkpoints:
             self.abandon()
 
     def keep_for(self, name: str) -> pathlib.Path | None:
-        """Keep a copy of the last checkpoint for good; returns its folder, or None if there is no checkpoint."""
+        """Keep a copy of the last checkpoint permanently; returns its folder, or None if there is no checkpoint."""
         self.wait()
         found = self._listed()
         if not found:
@@ -129,13 +129,13 @@ class Checkpoints:
         return kept
 
     def abandon(self) -> None:
-        """End the thread after the last `save`; errors of that are ignored."""
+        """End the thread after the last `save`, and ignore errors of writing it."""
         self._thread.shutdown()
 
     # Writing
 
     def _new_timesteps(self, timesteps: Any, added: np.ndarray) -> tuple[list[int], list[int], dict[str, np.ndarray]]:
-        """The timesteps that are in no file yet; seeds with fewer new ones than others are padded."""
+        """The timesteps that are in no file yet. Seeds with fewer new timesteps than others are padded."""
         capacity = jax.tree.leaves(timesteps)[0].shape[1]
         stop = [int(number) for number in added]
         written = self._segments[-1].stop if self._segments else [0] * len(stop)
@@ -155,7 +155,7 @@ class Checkpoints:
             self._segments.append(Segment(path.name, start, stop, len(content), _sha256(content)))
         final = self.folder / f"{_next_number(self.folder):06d}-step-{step}"
         temporary = self.folder / f".{final.name}.tmp"
-        for left in self.folder.glob(".*.tmp"):  # of a process that was killed
+        for left in self.folder.glob(".*.tmp"):  # left by a process that was killed
             shutil.rmtree(left)
         temporary.mkdir()
         content = arrays.packed(state)
@@ -182,19 +182,19 @@ class Checkpoints:
     # Reading
 
     def _listed(self) -> list[pathlib.Path]:
-        """The newest first."""
+        """The checkpoints, the newest first."""
         return sorted(listed(self.folder.parent), reverse=True)
 
     def restore(self, like: Any, timesteps: Any, renamed: Mapping[str, str] = MappingProxyType({})) -> Found:
-        """The newest undamaged checkpoint; the next `save` goes on from it.
+        """Read the newest undamaged checkpoint. The next `save` writes only what is newer.
 
         Args:
-            like: a tree of the structure, shapes and types of what was saved.
-            timesteps: the same of the ring, whose capacity may have changed.
-            renamed: the old names of arrays in checkpoints of older versions, by their present names.
+            like: a tree with the structure, shapes and types of the saved one.
+            timesteps: the same for the ring buffer, whose capacity may have changed.
+            renamed: names of arrays in checkpoints of older versions, by their present names.
 
         Raises:
-            UserError: there is no undamaged one, or it is of another training or version.
+            UserError: there is no undamaged checkpoint, or it is from another training or version.
         """
         passed_over = []
         for path in self._listed():
@@ -209,10 +209,10 @@ class Checkpoints:
             rings = self._timesteps(timesteps, self._segments)
             return Found(content["step"], content["progress"], tree, rings, passed_over)
         why = f": {passed_over[0]}" if passed_over else "."
-        raise UserError(f"{self.folder.parent} has no checkpoint to go on from{why}")
+        raise UserError(f"{self.folder.parent} has no checkpoint to continue from{why}")
 
     def _checked(self, path: pathlib.Path) -> dict[str, Any]:
-        """The manifest, after every file that it names was checked."""
+        """The manifest. Every file that it names has been checked."""
         content = _content(path)
         if content.get("format") != FORMAT:
             raise UserError(
@@ -251,13 +251,13 @@ def was_ever_written(folder: pathlib.Path) -> bool:
 
 
 def _next_number(folder: pathlib.Path) -> int:
-    """One more than any number of a file here, so that no file is ever replaced."""
+    """One more than the largest number of a file here, so that no file is ever replaced."""
     found = (re.search(r"\d{6}", path.name) for path in folder.iterdir())
     return max((int(number[0]) for number in found if number), default=0) + 1
 
 
 def _on_host(leaf: Any) -> Any:
-    """On a CPU a view of JAX's memory, without a copy; on other devices the array, to be indexed there."""
+    """On a CPU a view of JAX's memory, without a copy. On other devices the array itself, which is indexed there."""
     return np.asarray(leaf) if jax.default_backend() == "cpu" else leaf
 
 

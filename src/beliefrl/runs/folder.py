@@ -25,7 +25,7 @@ def make(folder: pathlib.Path, config: dict[str, Any]) -> None:
     An existing folder is used if it is empty, or if its training saved nothing; see `clear`.
 
     Raises:
-        UserError: it exists and holds something else, or it cannot be made.
+        UserError: the folder contains other files, or it cannot be made.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -40,7 +40,7 @@ def clear(folder: pathlib.Path) -> None:
     """Remove the files of a training that ended before it saved anything; the folder itself stays.
 
     Raises:
-        UserError: it holds an agent, a checkpoint or a file that no training writes; or a process is training there.
+        UserError: the folder contains an agent, a checkpoint or a file that no training writes; or it is in use.
     """
     inside = [path.relative_to(folder).as_posix() for path in folder.rglob("*")]
     is_run = _is_of_training(folder)
@@ -63,7 +63,7 @@ def write_config(folder: pathlib.Path, config: dict[str, Any]) -> None:
 
 
 def locked(folder: pathlib.Path, doing: str) -> Any:
-    """An open file that no other process can lock; the system unlocks it when this process ends.
+    """An open file that no other process can lock. The system unlocks it when this process ends.
 
     Raises:
         UserError: the folder cannot be written, or another process has locked it.
@@ -76,7 +76,7 @@ def locked(folder: pathlib.Path, doing: str) -> Any:
         import fcntl
 
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except ImportError:  # not on this system
+    except ImportError:  # this system has no fcntl
         return file
     except OSError:
         file.seek(0)
@@ -90,12 +90,12 @@ def locked(folder: pathlib.Path, doing: str) -> Any:
     except OSError as error:
         with contextlib.suppress(OSError):
             file.close()
-        raise UserError(f"{folder} cannot be written ({error.strerror}): make room for it.") from None
+        raise UserError(f"{folder} cannot be written ({error.strerror}): free some space.") from None
     return file
 
 
 def _is_of_training(folder: pathlib.Path) -> bool:
-    """Whether a training wrote the config.json there."""
+    """Whether a training wrote the config.json in the folder."""
     return records.is_complete(records.parsed(folder / "config.json"))
 
 

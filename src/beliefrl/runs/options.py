@@ -1,4 +1,4 @@
-"""The options of a training: how long, how often and how it is evaluated, with the range of each."""
+"""The options of a training: its length, evaluations and checkpoints, with the range of each option."""
 
 import dataclasses
 from typing import Literal, get_args
@@ -6,46 +6,46 @@ from typing import Literal, get_args
 from beliefrl.runs import trackers
 from beliefrl.types import UserError, check_choice, check_range
 
-MOST_EPISODES = 100_000  # in parallel
+MOST_EPISODES = 100_000  # they run in parallel
 Processes = Literal["auto", "always", "never"]
-Precision = Literal["float32", "tensorfloat32"]  # by their names in JAX
+Precision = Literal["float32", "tensorfloat32"]  # names in JAX
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """How long a training is, and how it is evaluated and saved."""
+    """The length of a training, and how it is evaluated and saved."""
 
     steps: int = 20_000
     """Environment steps of each seed, rounded up to whole cycles of the agent."""
     seeds: int = 1
-    """How many seeds are trained, side by side in one program."""
+    """Number of seeds. They are trained side by side in one program."""
     seed: int = 0
-    """Number of the first seed; the others follow it."""
+    """Number of the first seed. The others have the following numbers."""
     eval_every: int = 2_000
     """Environment steps between two evaluations (Appendix B)."""
     eval_episodes: int = 5
-    """Episodes of each evaluation, with sampled actions and again with mode actions."""
+    """Episodes in each evaluation with sampled actions, and again with mode actions."""
     replay_capacity: int = 1_000_000
-    """Most timesteps that a seed's replay keeps; new ones replace the oldest."""
+    """Maximum number of timesteps in a seed's replay. New ones replace the oldest."""
     processes: Processes = "auto"
-    """Gymnasium environments: a process for each (always), for none (never), or where a measurement says that it pays
-    (auto). From Python, auto is never, and a script that says always must guard its main module with `if __name__ ==
-    "__main__":`."""
+    """Whether each Gymnasium environment has a process of its own: always, never, or only if a measurement shows that
+    this is faster (auto). From Python, auto means never, unless own_process=True. A Python script that uses processes
+    must guard its main code with `if __name__ == "__main__":`."""
     checkpoint_steps: int = 2_000
-    """Environment steps between two checkpoints of everything (0: none by steps)."""
+    """Environment steps between two checkpoints. 0: no checkpoints by steps."""
     checkpoint_minutes: float = 10.0
-    """Minutes between two checkpoints, if they pass sooner (0: none by time)."""
+    """Maximum number of minutes between two checkpoints. 0: no checkpoints by time."""
     keep_checkpoints: int = 2
-    """How many of the last checkpoints are kept."""
+    """Number of the latest checkpoints that are kept."""
     precision: Precision = "float32"
-    """Precision of matrix products: float32, or tensorfloat32, which lets an NVIDIA GPU (Ampere or later) round their
-    factors to 10 bits of mantissa to be faster. A CPU computes in float32 either way."""
+    """Precision of matrix products: float32 or tensorfloat32. With tensorfloat32, an NVIDIA GPU (Ampere or later) may
+    round the factors to 10 bits of mantissa, which is faster. A CPU always computes in float32."""
     track: tuple[Literal["tensorboard", "wandb"], ...] = ("tensorboard",)
-    """Trackers that get the numbers besides the run's own logs: tensorboard, wandb (extra `wandb`; offline unless
-    WANDB_MODE says otherwise), both, or none."""
+    """Trackers that receive the logged numbers, besides the run's own log: tensorboard, wandb, both, or none. wandb
+    needs the extra `wandb`, and is offline unless WANDB_MODE is set."""
 
     def __post_init__(self) -> None:
-        """Refuse impossible values with a UserError."""
+        """Raise a UserError if a value is impossible."""
         check_range(self, ("steps", "eval_every", "replay_capacity"), 1)
         check_range(self, ("eval_episodes",), 1, MOST_EPISODES)
         check_range(self, ("checkpoint_steps", "checkpoint_minutes"), 0)

@@ -30,7 +30,7 @@ def now() -> str:
 
 
 def _git_commit() -> str | None:
-    """The commit of the running source, with a + if it has changes; None outside a checkout."""
+    """The commit of the running code, with a + if there are uncommitted changes; None outside a git checkout."""
     try:
         found = subprocess.run(
             ["git", "describe", "--always", "--abbrev=40", "--dirty=+", "--match="],

@@ -1,7 +1,7 @@
-"""The JSON in a run's folder: logs line by line, and checks of what is read.
+"""The JSON in a run's folder: logs, read line by line, and checks of the content.
 
-A damaged file must cause a UserError, never a traceback, so the keys and types that readers rely on are checked here.
-The ranges of options are in `Options`, those of settings in the agents.
+A damaged file must cause a UserError and no traceback. So the keys and types that readers need are checked here. The
+ranges of options are checked by `Options`, and those of hyperparameters by the agents.
 """
 
 import json
@@ -15,7 +15,7 @@ Row = dict[str, Any]
 
 
 def parsed(path: pathlib.Path) -> Any:
-    """The content of a file of JSON; None if it cannot be read."""
+    """The content of a JSON file; None if it cannot be read."""
     try:
         return _json(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -23,7 +23,7 @@ def parsed(path: pathlib.Path) -> Any:
 
 
 def _json(text: str) -> Any:
-    """The value of a text of JSON; None if it is not JSON."""
+    """The value of a JSON text; None if the text is not JSON."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError):
@@ -31,7 +31,7 @@ def _json(text: str) -> Any:
 
 
 def is_complete(config: Any) -> bool:
-    """Whether a config.json holds all that is read from it; the values of its options are not checked."""
+    """Whether a config.json contains everything that readers need. The values of its options are not checked."""
     kinds = {"agent": str, "hyperparameters": dict, "task": str, "constants": dict, "options": dict}
     if not isinstance(config, dict) or not all(isinstance(config.get(key), kind) for key, kind in kinds.items()):
         return False
@@ -42,16 +42,16 @@ def is_complete(config: Any) -> bool:
 
 
 def _is_session(session: Any) -> bool:
-    """Whether it can be a record of `provenance`."""
+    """Whether the value can be a record of `provenance`."""
     if not isinstance(session, dict):
         return False
     return isinstance(session.get("versions", {}), dict) and isinstance(session.get("command", []), list)
 
 
 def lines(log: pathlib.Path) -> Iterator[tuple[int, Row | None]]:
-    """Every line of a log with its number, None where it is damaged; nothing where there is no log.
+    """Every line of a log with its number, or None if the line is damaged. Empty if there is no log.
 
-    A last line without its end is left out: a training is writing it, or was killed as it did.
+    An incomplete last line is left out: a training is writing it, or was killed while it wrote it.
 
     Raises:
         UserError: the log cannot be read.
@@ -87,7 +87,7 @@ def last_rows(log: pathlib.Path, size: int = 32_768) -> list[Row]:
 
 
 def damage(log: pathlib.Path) -> str | None:
-    """A sentence on the damaged lines of a log, None if it has none.
+    """A sentence about the damaged lines of a log; None if there are none.
 
     Raises:
         UserError: the log cannot be read.
@@ -101,7 +101,7 @@ def damage(log: pathlib.Path) -> str | None:
 
 
 def _row(line: str) -> Row | None:
-    """A line of a log; None if it is not what a training writes."""
+    """The entry in a line of a log; None if the line is damaged."""
     row = _json(line)
     if not isinstance(row, dict) or not isinstance(row.get("kind"), str) or not _is_step(row.get("step")):
         return None
@@ -123,12 +123,12 @@ def _are_numbers(values: Any) -> bool:
 
 
 def _is_value(value: Any) -> bool:
-    """Whether it is a text, a number, or numbers."""
+    """Whether the value is a text, a number, or a list of numbers."""
     return isinstance(value, str) or _is_number(value) or _are_numbers(value)
 
 
 def is_summary(results: Any, seeds: int) -> bool:
-    """Whether a results.json is the summary of an evaluation (`evaluation.summary`) of so many seeds, or empty."""
+    """Whether `results` is empty, or the summary of an evaluation (`evaluation.summary`) of `seeds` seeds."""
     if results == {}:
         return True
     if not isinstance(results, dict) or not _is_step(results.get("step")):
@@ -139,7 +139,7 @@ def is_summary(results: Any, seeds: int) -> bool:
 
 
 def _is_mode(mode: Any, seeds: int) -> bool:
-    """Whether it is what a summary says of one mode."""
+    """Whether `mode` is the part of a summary for one kind of actions."""
     if not isinstance(mode, dict) or not {"mean", "sem", "seeds", "success", "seeds_success"} <= mode.keys():
         return False
     returns, rates = mode["seeds"], mode["seeds_success"]

@@ -1,14 +1,14 @@
-"""A run's folder, which a training writes. This file knows files, no reinforcement learning.
+"""A run's folder, which a training writes.
 
     config.json           agent, task, options, versions, git commit, command line
-    metrics/seed-0.jsonl  a line for every entry: {"step", "kind": "update" | "episode" | "evaluation", ...}
-    tensorboard/seed-0/   the same as TensorBoard events
+    metrics/seed-0.jsonl  one line for each entry: {"step", "kind": "update" | "episode" | "evaluation", ...}
+    tensorboard/seed-0/   the same entries as TensorBoard events
     agent.safetensors     the agents of all seeds at the last evaluation (leading axis: seed); plain arrays, no code
     results.json          the returns of the last evaluation
     curve.png             the learning curve
 
-Lines are written out one by one, so a killed training loses at most the line it was writing, which `rows` skips.
-What is read is checked on reading (`records`), so readers need not check it again.
+Lines are flushed one by one, so a killed training loses at most the line that it was writing, and `rows` skips it. The
+content of files is checked when it is read (`records`), so callers need not check it again.
 """
 
 import contextlib
@@ -32,18 +32,18 @@ from beliefrl.types import UserError, tuples
 
 
 class Run:
-    """A run's folder, to be read."""
+    """A run's folder, for reading."""
 
     def __init__(self, folder: str | os.PathLike[str]):
         """Open the folder of a training.
 
         Raises:
-            UserError: it does not exist, no training made it, its config.json is damaged, or it is no path.
+            UserError: the folder does not exist, is not a run, its config.json is damaged, or `folder` is no path.
         """
         if not isinstance(folder, str | os.PathLike):
             raise UserError(f"{folder!r} is not a run: give a run, or the path of its folder.")
         self.folder = pathlib.Path(folder)
-        if not os.path.isdir(self.folder):  # noqa: PTH112 - pathlib's raises where a name is too long
+        if not os.path.isdir(self.folder):  # noqa: PTH112 - pathlib's version raises if a name is too long
             raise UserError(f"There is no run folder {self.folder}: give the --out of a training.")
         path = self.folder / "config.json"
         if not path.exists():
@@ -52,7 +52,7 @@ class Run:
         if self.config is None:
             raise UserError(f"{path} cannot be read as JSON: restore it, or train again.")
         if not records.is_complete(self.config):
-            raise UserError(f"{path} lacks what a training writes there: restore it, or train again.")
+            raise UserError(f"{path} lacks entries that every training writes: restore it, or train again.")
         try:
             _ = self.options
         except UserError as error:
@@ -60,7 +60,7 @@ class Run:
 
     @property
     def options(self) -> Options:
-        """The options of the training; options of other versions are left out."""
+        """The options of the training. Options that only other versions have are left out."""
         known = {field.name for field in dataclasses.fields(Options)}
         given = tuples(self.config["options"])
         return Options(**{name: value for name, value in given.items() if name in known})
@@ -73,11 +73,11 @@ class Run:
 
     @property
     def precision(self) -> str:
-        """That of matrix products in training, for `jax.default_matmul_precision`; float32 where none was recorded."""
+        """The precision of matrix products, for `jax.default_matmul_precision`; float32 if none was recorded."""
         return self.options.precision
 
     def rows(self, seed: int, kind: str | None = None) -> Iterator[Row]:
-        """The log of a seed in the order it was written; of one kind, if given. Damaged lines are left out.
+        """The entries of a seed's log in order, or those of one `kind`. Damaged lines are left out.
 
         Raises:
             UserError: the log cannot be read.
@@ -86,16 +86,16 @@ class Run:
         return (row for row in rows if row is not None and kind in (None, row["kind"]))
 
     def damage(self) -> list[str]:
-        """What is wrong with the logs: a sentence for each that has damaged lines, and one if some are missing."""
+        """One sentence for each log with damaged lines, and one if logs are missing."""
         found = [records.damage(self._metrics(seed)) for seed in self.seeds]
         missing = [seed for seed in self.seeds if not self._metrics(seed).exists()]
         if missing:
             logs = f"the log of seed {missing[0]}" if len(missing) == 1 else f"the logs of {len(missing)} seeds"
-            found.append(f"{self.folder / 'metrics'} lacks {logs}: what has no log counts as not begun.")
+            found.append(f"{self.folder / 'metrics'} lacks {logs}: a seed without a log counts as not started.")
         return [sentence for sentence in found if sentence is not None]
 
     def last_rows(self, seed: int) -> list[Row]:
-        """The last entries of a seed's log, of a run that may be going on.
+        """The last entries of a seed's log. The run may still be training.
 
         Raises:
             UserError: the log cannot be read.
@@ -106,10 +106,10 @@ class Run:
         return self.folder / "metrics" / f"seed-{seed}.jsonl"
 
     def results(self) -> Row | None:
-        """The summary of the last evaluation; None before there was one.
+        """The summary of the last evaluation; None before the first one.
 
         Raises:
-            UserError: it is not what a training writes.
+            UserError: results.json is damaged.
         """
         path = self.folder / "results.json"
         if not path.exists():
@@ -120,10 +120,10 @@ class Run:
         return results
 
     def load(self, like: Any) -> Any:
-        """The saved agents, in a tree of the structure, shapes and types of `like`.
+        """The saved agents, in a tree with the structure, shapes and types of `like`.
 
         Raises:
-            UserError: nothing was saved yet, or what was saved is damaged or of another shape.
+            UserError: no agent was saved yet, or the file is damaged or does not fit `like`.
         """
         path = self.folder / "agent.safetensors"
         if not path.exists():
@@ -132,14 +132,14 @@ class Run:
 
 
 class Recorder(Run):
-    """A run's folder that only this process writes."""
+    """A run's folder, for writing. Only this process can write it."""
 
     def __init__(self, folder: str | os.PathLike[str], config: dict[str, Any] | None):
-        """Make the folder; without a config, go on with one that exists.
+        """Make the folder. Without a config, open an existing one.
 
         Raises:
-            UserError: it exists already, or cannot be made; or does not exist, or another process writes it; or a
-                tracker cannot be opened.
+            UserError: the folder exists already or cannot be made (with a config), does not exist (without), or is
+                written by another process; or a tracker cannot be opened.
         """
         folder = pathlib.Path(folder)
         if config is not None:
@@ -161,7 +161,7 @@ class Recorder(Run):
         try:
             self.close()
         except Exception:
-            if kind is None:  # else the first error is reported
+            if kind is None:  # otherwise the first error is reported
                 raise
 
     def _open(self) -> None:
@@ -171,34 +171,36 @@ class Recorder(Run):
             try:
                 self._lines[seed] = path.open("a", buffering=1)
             except OSError as error:
-                raise UserError(f"{path} cannot be written ({error.strerror}): fix that, then try again.") from None
+                raise UserError(
+                    f"{path} cannot be written ({error.strerror}): fix the cause, then try again."
+                ) from None
             self._trackers[seed] = trackers.open_all(track, self.folder, seed, self.config)
 
     def note_end(self) -> None:
-        """Record when this process has finished with the run; a full disk is ignored."""
+        """Record the time at which this session ends. A full disk is ignored."""
         session = self.config["resumed"][-1] if self.config.get("resumed") else self.config
         session["ended"] = now()
         with contextlib.suppress(OSError):
             write_config(self.folder, self.config)
 
     def amend(self, changes: dict[str, Any], session: dict[str, Any]) -> None:
-        """Change the config, and add a session to its `resumed`."""
+        """Change the config, and append a session to its `resumed`."""
         self.config |= changes
         self.config["resumed"] = [*self.config.get("resumed", ()), session]
         write_config(self.folder, self.config)
 
     def lengths(self) -> dict[int, int]:
-        """Flush the log of each seed to the disk; returns their sizes in bytes."""
+        """Flush the log of each seed to the disk; returns the sizes of the logs in bytes."""
         for lines in self._lines.values():
             lines.flush()
             os.fsync(lines.fileno())
         return {seed: self._metrics(seed).stat().st_size for seed in self.seeds}
 
     def rewind(self, lengths: dict[int, int]) -> None:
-        """Truncate the log of each seed to so many bytes, and append from there.
+        """Truncate the log of each seed to its length in bytes. New entries are appended there.
 
         Raises:
-            UserError: a log is shorter.
+            UserError: a log is shorter than that.
         """
         for seed, length in lengths.items():
             path = self._metrics(seed)
@@ -214,7 +216,7 @@ class Recorder(Run):
                 _track(whole, row["kind"], row["step"], row)
 
     def log(self, seed: int, kind: str, step: int, values: Row) -> None:
-        """Write one entry of a seed; its trackers get the numbers, and the means of lists."""
+        """Write one entry of a seed. Its trackers receive the numbers, and the means of lists."""
         self._lines[seed].write(json.dumps({"step": step, "kind": kind, **values}) + "\n")
         _track(self._trackers[seed], kind, step, values)
 
@@ -225,7 +227,7 @@ class Recorder(Run):
                 tracker.flush()
 
     def save(self, agents: Any, but: Collection[int] = ()) -> None:
-        """Save the agents of all seeds atomically; those of the seeds `but` (indices) stay as they were saved."""
+        """Save the agents of all seeds atomically; those of the seeds `but` (indices) are not changed."""
         path, saved = self.folder / "agent.safetensors", arrays.copied(agents)
         before = arrays.load(path) if but and path.exists() else {}
         for name, kept in before.items():

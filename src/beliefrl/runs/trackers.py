@@ -1,7 +1,7 @@
-"""Where a run's numbers go besides its own logs: TensorBoard, Weights & Biases. Chosen by `--track`.
+"""Trackers, which receive a run's numbers besides its own log: TensorBoard, Weights & Biases. `--track` selects them.
 
-Nothing here goes over the network of its own accord: Weights & Biases is kept offline, in the run's folder, until the
-user says WANDB_MODE=online or sends it with `wandb sync`.
+By default nothing is sent over the network. Runs of Weights & Biases are offline, in the run's folder. The user uploads
+them with `wandb sync`, or sets WANDB_MODE=online.
 """
 
 import importlib.util
@@ -19,7 +19,7 @@ from beliefrl.types import UserError, said
 class Tracker(Protocol):
     """Receives the numbers of one seed."""
 
-    is_whole: bool  # receives all entries again when a training is resumed; else only new ones
+    is_whole: bool  # whether it receives all entries again when a training is resumed, or only the new ones
 
     def log(self, step: int, values: dict[str, float]) -> None: ...
     def flush(self) -> None: ...
@@ -30,14 +30,14 @@ class TensorBoard:
     """Event files in tensorboard/seed-N.
 
     tensorboardX's SummaryWriter writes in a thread of its own. On a full disk that thread ends, and the caller
-    waits for it for ever. So the events are written here, and an error is raised where it occurs.
+    waits for it forever. So the events are written here, and an error is raised where it occurs.
     """
 
     is_whole = True
 
     def __init__(self, folder: pathlib.Path, seed: int, config: dict[str, Any]):
         from tensorboardX.event_file_writer import EventsWriter  # 0.5 s to import
-        from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue] - made at import
+        from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue] - defined at import
         from tensorboardX.summary import scalar
 
         path = folder / "tensorboard" / f"seed-{seed}"
@@ -58,7 +58,7 @@ class TensorBoard:
 
 
 class WandB:
-    """A run of Weights & Biases a seed, all of one group, in wandb/."""
+    """A run of Weights & Biases for each seed, all in one group, in wandb/."""
 
     is_whole = False
 
@@ -85,7 +85,7 @@ class WandB:
         self._run.log({"step": step, **values})
 
     def flush(self) -> None:
-        """It writes by itself."""
+        """Nothing to do: wandb writes in a thread."""
 
     def close(self) -> None:
         self._run.finish()
@@ -99,7 +99,7 @@ TRACKERS: dict[str, type[TensorBoard] | type[WandB]] = {"tensorboard": TensorBoa
 
 
 def check(names: Sequence[str]) -> None:
-    """Raise a UserError where a tracker's package is not installed."""
+    """Raise a UserError if the package of a tracker is not installed."""
     if "wandb" in names and importlib.util.find_spec("wandb") is None:
         raise UserError("track=wandb needs Weights & Biases: pip install 'beliefrl[wandb]'.")
 

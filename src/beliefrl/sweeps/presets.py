@@ -24,7 +24,7 @@ SCALABILITY_STEPS = 100_000  # the paper's table (Appendix G)
 
 LEARNING_RATES = (4e-4, 6e-4, 8e-4, 1e-3)  # Appendix F
 LENGTHS = (16, 32, 64)
-MOMENTS = 256  # time steps in a batch, for every sequence length
+TIMESTEPS = 256  # timesteps in a batch, for every sequence length
 REPEATS = 20
 PAPERS = {"lr_model": 8e-4, "seq_len": 64, "batch_size": 4}  # Table 2
 
@@ -52,10 +52,10 @@ def _compared(tasks: Sequence[str], agents: Sequence[str], seeds: Sequence[int] 
 
 
 def drawn(seed: int) -> dict[str, float]:
-    """The settings that the sensitivity study draws for a seed; a batch has 256 time steps (Appendix F)."""
+    """The settings that the sensitivity study draws for a seed; a batch has 256 timesteps (Appendix F)."""
     random = np.random.default_rng(seed)
     length = int(random.choice(LENGTHS))
-    return {"lr_model": float(random.choice(LEARNING_RATES)), "seq_len": length, "batch_size": MOMENTS // length}
+    return {"lr_model": float(random.choice(LEARNING_RATES)), "seq_len": length, "batch_size": TIMESTEPS // length}
 
 
 def _sensitivity(tasks: Sequence[str], agents: Sequence[str], seeds: Sequence[int] | None) -> list[Experiment]:

@@ -148,4 +148,4 @@ def _lock(folder: pathlib.Path) -> Any:
         raise UserError(
             f"The sweep's folder {folder} cannot be made ({error.strerror}): choose another --out."
         ) from None
-    return locked(folder, "is being swept")
+    return locked(folder, "is in use")

@@ -1,4 +1,4 @@
-"""Play one episode of a trained agent on any task, and record every time step.
+"""Play one episode of a trained agent on any task, and record every timestep.
 
     trajectory = beliefrl.play("runs/first", at=range(0, 200, 20))
     trajectory.total, trajectory.steps.obs, trajectory.frames[20]
@@ -24,16 +24,16 @@ from beliefrl.viewing.rendering import Pixels
 
 
 class Trajectory(NamedTuple):
-    """A recorded episode. After T actions it has T + 1 time steps, from the first observation to the last."""
+    """A recorded episode. After T actions it has T + 1 timesteps, from the first observation to the last."""
 
     steps: Timestep  # numpy, leaves (time, ...); prev_action[t] led to reward[t] and obs[t]
     total: float  # undiscounted return
     success: bool | None  # whether it succeeded; None if the task does not define success
-    frames: dict[int, Pixels]  # the requested frames, by time step
+    frames: dict[int, Pixels]  # the requested frames, by timestep
 
 
 class Frame(NamedTuple):
-    """The rendered picture of one time step."""
+    """The rendered picture of one timestep."""
 
     time: int  # actions before it
     total: float  # sum of the rewards up to it
@@ -108,7 +108,7 @@ class Player:
 
 
 def _timestep(obs: Any, reward: float, action: Any, is_first: bool = False, terminated: bool = False) -> Timestep:
-    """A time step in numpy."""
+    """A timestep in numpy."""
     numbers: Any = np.asarray(obs, np.float32), np.float32(reward), np.asarray(action, np.float32)
     flags: Any = np.bool_(is_first), np.bool_(terminated)
     return Timestep(*numbers, *flags)
@@ -132,7 +132,7 @@ def play(
         episode_seed: random seed of the episode and its actions. The same seed gives the same episode.
         sampled: sample the actions, instead of taking the policy's mode.
         steps: stop after this many steps; None: play until the task ends the episode.
-        at: time steps of which to keep a frame, such as range(0, 1000, 10). The last time step is added, unless `at` is
+        at: timesteps of which to keep a frame, such as range(0, 1000, 10). The last timestep is added, unless `at` is
             empty.
         task: needed only if the run was trained on a task of your own.
         agent: needed only if the run was trained by an agent of your own: its class, or an instance.

@@ -54,7 +54,7 @@ def video(
         episode_seed: random seed of the first episode; the next episodes have the following seeds.
         sampled: sample the actions, instead of taking the policy's mode.
         episodes: number of episodes, shown one after the other.
-        fps: time steps per second of the video, each with a frame. None: real time, with at most 50 frames per second;
+        fps: timesteps per second of the video, each with a frame. None: real time, with at most 50 frames per second;
             a task whose step has no known duration gets 10 steps per second.
         steps: stop each episode after this many steps; None: play until the task ends it.
         task: needed only if the run was trained on a task of your own.

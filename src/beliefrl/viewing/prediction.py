@@ -32,7 +32,7 @@ from beliefrl.training.evaluation import restore_seed
 from beliefrl.types import LARGEST, Timestep, UserError, perception
 from beliefrl.viewing.episodes import Player, check_episode
 
-START = 50  # default number of time steps that the closed loop observes
+START = 50  # default number of timesteps that the closed loop observes
 TRUTH, OPEN, CLOSED = "#a9a79e", "#1f6f8b", "#c8553d"
 
 
@@ -42,7 +42,7 @@ class Predictions(NamedTuple):
     title: str
     entries: tuple[int, ...]  # indices of the observed entries in the task's full observation
     names: tuple[str, ...]  # names of the columns: entries of the task, or "entry 2"; then "reward"
-    start: int  # the first time step that the closed loop does not observe
+    start: int  # the first timestep that the closed loop does not observe
     truth: Float[np.ndarray, "time x"]
     open_loop: Gaussian  # leaves (time, x); NaN where nothing is predicted; σ = 0 for a deterministic model
     closed_loop: Gaussian  # the same; equal to the open loop before `start`
@@ -65,7 +65,7 @@ def predict(
 ) -> Gaussian:
     """Mean and σ of `samples` sampled predictions of a `Predictive` agent, leaves (time, x).
 
-    `seen` (time,) says which time steps the model observes.
+    `seen` (time,) says which timesteps the model observes.
     """
     draw = jax.vmap(lambda key: agent.predict(state, model, steps, seen, key))
     mean, sigma = draw(jax.random.split(key, samples))
@@ -90,8 +90,8 @@ def predictions(
         run: a run, or its folder.
         seed: one of the run's seeds; None: its first.
         model: "keep" or "first" for vrm, "latent" for slac; None: the first of these that the agent has.
-        start: number of time steps that the closed loop observes; None: 50, or half of a shorter episode.
-        horizon: number of time steps that it predicts after that, at most to the end of the episode.
+        start: number of timesteps that the closed loop observes; None: 50, or half of a shorter episode.
+        horizon: number of timesteps that it predicts after that, at most to the end of the episode.
         samples: number of samples in the mean of each prediction.
         episode_seed: random seed of the episode, its actions and the samples.
         sampled: sample the actions, instead of taking the policy's mode.
@@ -112,7 +112,7 @@ def predictions(
     start = min(START, length // 2) if start is None else start
     if start >= length:
         raise UserError(
-            f"start={start} is impossible: the episode has {length} time steps, so give {length - 1} or less."
+            f"start={start} is impossible: the episode has {length} timesteps, so give {length - 1} or less."
         )
     steps = jax.tree.map(lambda leaf: leaf[: start + horizon], steps)
 
