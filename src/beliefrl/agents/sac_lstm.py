@@ -5,7 +5,7 @@ resets inside windows are those of VRM; the gradients of J_π (through μ and lo
 through the targets and through the Q of the actor's loss do not.
 
 Departure: V̄ reads the state of a target LSTM, which moves as V̄ does. With the state of the LSTM that learns, as in the
-authors' code, the target moves with every update, and what was learned is lost again (docs/agents/sac-lstm.md).
+authors' code, the target moves with every update, and what was learned is lost again (docs/agents/alternatives.md).
 """
 
 import dataclasses
