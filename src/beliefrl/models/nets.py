@@ -81,19 +81,16 @@ class LSTMState(NamedTuple):
     c: Float[Array, "*batch d"]  # its cell
 
 
-class LSTMSaved(NamedTuple):
-    """What the gradient of `lstm_step` needs, leaves (*batch, d): gates after their σ or tanh, c before, tanh c'."""
+class LSTMSlopes(NamedTuple):
+    """Derivatives of one step of an LSTM, entry by entry."""
 
-    i: Float[Array, "*batch d"]
-    f: Float[Array, "*batch d"]
-    g: Float[Array, "*batch d"]
-    o: Float[Array, "*batch d"]
-    c: Float[Array, "*batch d"]
-    tanh_c: Float[Array, "*batch d"]
+    gates: Float[Array, "*batch 4*d"]  # of c' by the pre-activations i, f, g, and of d' by o
+    d: Float[Array, "*batch d"]  # of d' by c'
+    c: Float[Array, "*batch d"]  # of c' by c
 
 
-def lstm_step(gates: Float[Array, "*batch gates"], c: Float[Array, "*batch d"]) -> tuple[LSTMState, LSTMSaved]:
-    """The next state from the gates' pre-activations i, f, g, o side by side, and what `lstm_step_backward` needs:
+def lstm_step(gates: Float[Array, "*batch 4*d"], c: Float[Array, "*batch d"]) -> tuple[LSTMState, LSTMSlopes]:
+    """The next state from the gates' pre-activations i, f, g, o side by side, and its derivatives:
 
     c' = σ(f) c + σ(i) tanh g,   d' = σ(o) tanh c'
 
@@ -107,22 +104,16 @@ def lstm_step(gates: Float[Array, "*batch gates"], c: Float[Array, "*batch d"]) 
     i, f, o = (0.5 * gate + 0.5 for gate in (i, f, o))
     c_next = f * c + i * g
     tanh_c = jnp.tanh(c_next)
-    return LSTMState(o * tanh_c, c_next), LSTMSaved(i, f, g, o, c, tanh_c)
+    slopes = (g * i * (1 - i), c * f * (1 - f), i * (1 - g**2), tanh_c * o * (1 - o))
+    return LSTMState(o * tanh_c, c_next), LSTMSlopes(jnp.concatenate(slopes, axis=-1), o * (1 - tanh_c**2), f)
 
 
 def lstm_step_backward(
-    saved: LSTMSaved, grad: LSTMState
-) -> tuple[Float[Array, "*batch gates"], Float[Array, "*batch d"]]:
-    """The gradient of the gates and of c, given that of the next state."""
-    i, f, g, o, c, tanh_c = saved
-    grad_c = grad.c + grad.d * o * (1 - tanh_c**2)
-    grad_gates = (
-        grad_c * g * i * (1 - i),
-        grad_c * c * f * (1 - f),
-        grad_c * i * (1 - g**2),
-        grad.d * tanh_c * o * (1 - o),
-    )
-    return jnp.concatenate(grad_gates, axis=-1), grad_c * f
+    slopes: LSTMSlopes, grad: LSTMState
+) -> tuple[Float[Array, "*batch 4*d"], Float[Array, "*batch d"]]:
+    """The gradients of the gates and of c, given that of the next state."""
+    grad_c = grad.c + grad.d * slopes.d
+    return jnp.concatenate([grad_c, grad_c, grad_c, grad.d], axis=-1) * slopes.gates, grad_c * slopes.c
 
 
 class LSTM(eqx.Module):
@@ -152,17 +143,19 @@ class LSTM(eqx.Module):
 
 
 def _lstm_forward(w_d, before, given, noise):
-    state, saved = lstm_step(given + before.d @ w_d, before.c)
-    return state, state, (before.d, saved)
+    state, slopes = lstm_step(given + before.d @ w_d, before.c)
+    return state, state, (before.d, slopes)
 
 
 def _lstm_backward(w_d, memory, grad_state, grad_output):
-    grad_gates, grad_c = lstm_step_backward(memory.saved[1], jax.tree.map(jnp.add, grad_state, grad_output))
+    _, slopes = memory.saved
+    grad_gates, grad_c = lstm_step_backward(slopes, jax.tree.map(jnp.add, grad_state, grad_output))
     return LSTMState(grad_gates @ w_d, grad_c), grad_gates
 
 
 def _lstm_factors(memory, grad_gates):
-    return memory.saved[0], grad_gates
+    d_before, _ = memory.saved
+    return d_before, grad_gates
 
 
 LSTM_CELL = Cell(_lstm_forward, _lstm_backward, _lstm_factors)

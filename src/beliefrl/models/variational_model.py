@@ -10,8 +10,7 @@ Source: Section 4.1, Appendix A.1. With x_t = (o_t, r_{t-1}), a_{t-1} the action
 
 Speed decides the form. The posterior's first layers and the LSTM's gates are one layer, `Joint`, kept apart by what it
 multiplies: its products with f_x(x) and a are one batched product before the loop, prior and decoder run after it,
-and the loop keeps the products with d and z. The gradient of a weight inside the loop is one product after it
-(`_loop_backward`); plain differentiation would add up whole matrices at every step.
+and the loop keeps the products with d and z. The loop and its gradient are those of `recurrence`.
 
 Departure: one bias for each gate, where PyTorch's LSTM adds up two.
 """
@@ -231,21 +230,21 @@ class Given(NamedTuple):
 
 
 def _forward(weights, before, given, noise):
-    """One step of inference."""
+    """One step: prepares the posterior's hidden layers and the gates, draws z, and moves the LSTM."""
     hidden = weights.mean.shape[0]
     joint = given.joint + before.d @ weights.w_d
     first = jnp.tanh(joint[:, : 2 * hidden])
     mean = given.mean + first[:, :hidden] @ weights.mean
     sigma = jax.nn.softplus(given.sigma + first[:, hidden:] @ weights.sigma)
     z = mean + sigma * noise
-    state, saved = lstm_step(joint[:, 2 * hidden :] + z @ weights.w_z, before.c)
-    return state, Inferred(Gaussian(mean, sigma), z, before.d, state), (first, saved)
+    state, slopes = lstm_step(joint[:, 2 * hidden :] + z @ weights.w_z, before.c)
+    return state, Inferred(Gaussian(mean, sigma), z, before.d, state), (first, slopes)
 
 
 def _backward(weights, memory, grad_state, grad_output):
     """The gradient of one step; the weights are transposed."""
-    first, saved = memory.saved
-    grad_gates, grad_c = lstm_step_backward(saved, jax.tree.map(jnp.add, grad_state, grad_output.state))
+    first, slopes = memory.saved
+    grad_gates, grad_c = lstm_step_backward(slopes, jax.tree.map(jnp.add, grad_state, grad_output.state))
     grad_z = grad_output.z + grad_gates @ weights.w_z
     grad_mean = grad_output.posterior.mean + grad_z
     softplus_slope = -jnp.expm1(-memory.output.posterior.sigma)  # a sigmoid, of σ = softplus(x)
