@@ -55,7 +55,8 @@ def case(request):
     cell, *zeros = make()
     is_first = jnp.zeros((TIME, BATCH), bool).at[2, 1].set(True).at[0, 2].set(True)
     noise = jax.tree.map(lambda size: jax.random.normal(jax.random.key(size), (TIME, BATCH, size)), sizes)
-    return cell, random_like(zeros, jax.random.key(0)), (is_first, noise)
+    numbers = jax.tree.map(lambda leaf: 0.3 * leaf, random_like(zeros, jax.random.key(0)))
+    return cell, numbers, (is_first, noise)
 
 
 def test_the_gradient_is_that_of_plain_differentiation(case):

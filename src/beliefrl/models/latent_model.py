@@ -1,10 +1,10 @@
-"""SLAC's latent variable model: two latent variables a moment, z¹ inferred from the perception, z² a memory of it.
+"""SLAC's latent variable model: two latent variables at each timestep, z¹ inferred from x_t, z² from z¹.
 
 Source: Lee et al. 2019, Section 4; sizes and activations: Han, Doya, Tani 2020, Appendix A.2.3. With
 x_t = (o_t, r_{t-1}) and z_t = [z¹_t, z²_t]:
 
     posterior  q(z¹_t) = N(μ, σ)[x_t, z²_{t-1}, a_{t-1}]
-    prior      p(z¹_t) = N(μ, σ)[z²_{t-1}, a_{t-1}], and N(0, 1) at an episode's first moment
+    prior      p(z¹_t) = N(μ, σ)[z²_{t-1}, a_{t-1}], and N(0, 1) at an episode's first timestep
     both       p(z²_t) = N(μ, σ)[z¹_t, z²_{t-1}, a_{t-1}]
     decoders   p(o_t)  = N(μ, σ)[z_t],    p(r_{t-1}) = N(μ, σ)[z_{t-1}, a_{t-1}, z_t]
     ELBO               = Σ_t log p(o_t) + log p(r_{t-1}) - D_KL(q(z¹_t) ‖ p(z¹_t))
@@ -13,8 +13,8 @@ Speed decides the form: the products of the first layers with what does not come
 and prior and decoders run after it. The loop and its gradient are those of `recurrence`.
 
 Departures: perceptrons for convolutions, tanh, and a learned σ of the decoders, as Han et al. have it; μ and σ are two
-outputs of one perceptron, as Lee et al. have it (Han et al. have a perceptron for each, at twice the cost); and at an
-episode's first moment the same networks are used, with an input that marks it and zeros for z²_{t-1} and a_{t-1}, where
+outputs of one perceptron, as Lee et al. have it (Han et al. have a perceptron for each, at twice the cost); and an
+episode's first timestep uses the same networks, with an input that marks it and zeros for z²_{t-1} and a_{t-1}, where
 both papers have further networks.
 """
 
@@ -84,7 +84,7 @@ class LatentModel(eqx.Module):
 
     def __init__(self, obs: int, action: int, z1: int, z2: int, layers: tuple[int, ...]):
         """Widths: observation, action, both latent variables, and the hidden layers of every network."""
-        known = 1 + action  # whether it is the first moment, and a_{t-1}
+        known = 1 + action  # whether it is the first timestep, and a_{t-1}
         self.posterior = GaussianMLP(obs + 1 + known + z2, layers, z1)
         self.prior = GaussianMLP(z2 + action, layers, z1)
         self.next_z2 = GaussianMLP(known + z1 + z2, layers, z2)
@@ -119,10 +119,10 @@ def predict(
     observed: Bool[Array, " time"],
     noise: tuple[Float[Array, "time z1"], Float[Array, "time z2"]],
 ) -> Gaussian:
-    """p(x_t | z_{t-1}, a_{t-1}, z_t) along one episode from its first moment on, leaves (time, x).
+    """p(x_t | z_{t-1}, a_{t-1}, z_t) along one episode from its first timestep on, leaves (time, x).
 
     Where x_t is `observed`, z¹_t is drawn from the posterior: open loop. Where it is not, z¹_t is drawn from the prior:
-    closed loop. The first moment comes with no reward: NaN stands there.
+    closed loop. The first timestep has no reward: its entries are NaN.
     """
     is_first = jnp.arange(len(observed)) == 0
 
@@ -219,11 +219,11 @@ CELL = Cell(_forward, _backward, _factors)
 
 
 class LatentElboTerms(NamedTuple):
-    """The terms of the ELBO at every moment, summed over dimensions."""
+    """The terms of the ELBO at every timestep, summed over dimensions."""
 
     kl: Float[Array, "time batch"]
     log_obs: Float[Array, "time batch"]
-    log_reward: Float[Array, "time batch"]  # of the reward before the moment; 0 where there was none
+    log_reward: Float[Array, "time batch"]  # of r_{t-1}; 0 at an episode's first timestep
 
 
 def elbo_terms(

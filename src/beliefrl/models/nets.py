@@ -84,12 +84,12 @@ class LSTMState(NamedTuple):
 class LSTMSlopes(NamedTuple):
     """Derivatives of one step of an LSTM, entry by entry."""
 
-    gates: Float[Array, "*batch 4*d"]  # of c' by the pre-activations i, f, g, and of d' by o
+    gates: Float[Array, "*batch gates"]  # of c' by the pre-activations i, f, g, and of d' by o
     d: Float[Array, "*batch d"]  # of d' by c'
     c: Float[Array, "*batch d"]  # of c' by c
 
 
-def lstm_step(gates: Float[Array, "*batch 4*d"], c: Float[Array, "*batch d"]) -> tuple[LSTMState, LSTMSlopes]:
+def lstm_step(gates: Float[Array, "*batch gates"], c: Float[Array, "*batch d"]) -> tuple[LSTMState, LSTMSlopes]:
     """The next state from the gates' pre-activations i, f, g, o side by side, and its derivatives:
 
     c' = σ(f) c + σ(i) tanh g,   d' = σ(o) tanh c'
@@ -110,7 +110,7 @@ def lstm_step(gates: Float[Array, "*batch 4*d"], c: Float[Array, "*batch d"]) ->
 
 def lstm_step_backward(
     slopes: LSTMSlopes, grad: LSTMState
-) -> tuple[Float[Array, "*batch 4*d"], Float[Array, "*batch d"]]:
+) -> tuple[Float[Array, "*batch gates"], Float[Array, "*batch d"]]:
     """The gradients of the gates and of c, given that of the next state."""
     grad_c = grad.c + grad.d * slopes.d
     return jnp.concatenate([grad_c, grad_c, grad_c, grad.d], axis=-1) * slopes.gates, grad_c * slopes.c

@@ -157,7 +157,7 @@ def predict(
     observed: Bool[Array, " time"],
     noise: tuple[Float[Array, "time z"], Float[Array, "time x"]],
 ) -> Gaussian:
-    """p(x_t | z_t, d_{t-1}) along one episode from its first moment on, leaves (time, x).
+    """p(x_t | z_t, d_{t-1}) along one episode from its first timestep on, leaves (time, x).
 
     Where x_t is `observed`, z_t is drawn from the posterior: open loop. Elsewhere z_t is drawn from the prior, and the
     LSTM reads a draw of x_t from the decoder: closed loop. A deterministic model has σ = 0.
@@ -165,8 +165,8 @@ def predict(
 
     def step(state: LSTMState, inputs: tuple) -> tuple[LSTMState, Gaussian]:
         x, prev_action, observed, (noise_z, noise_x) = inputs
-        moment = jax.tree.map(lambda leaf: leaf[None, None], (x, prev_action, jnp.array(False), noise_z))
-        z = vrm.infer(jax.tree.map(lambda leaf: leaf[None], state), *moment).z[0, 0]
+        timestep = jax.tree.map(lambda leaf: leaf[None, None], (x, prev_action, jnp.array(False), noise_z))
+        z = vrm.infer(jax.tree.map(lambda leaf: leaf[None], state), *timestep).z[0, 0]
         if not vrm.deterministic:  # there posterior and prior are one
             prior = vrm.prior(state.d, prev_action)
             z = jnp.where(observed, z, prior.mean + prior.sigma * noise_z)
