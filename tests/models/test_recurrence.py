@@ -23,8 +23,8 @@ def lstm():
 
 def vrm():
     joint = 2 * HIDDEN + 4 * D
-    weights = shapes(w_d=(D, joint), w_z=(Z, 4 * D), mean=(HIDDEN, Z), sigma=(HIDDEN, Z))
-    given = variational_model.Given(**shapes(TIME, BATCH, joint=joint, mean=Z, sigma=Z))
+    weights = shapes(w_d=(D, joint), w_z=(Z, 4 * D), mean=(HIDDEN, Z), sigma=(HIDDEN, Z), mean_bias=Z, sigma_bias=Z)
+    given = jnp.zeros((TIME, BATCH, joint))
     start = LSTMState(*jnp.zeros((2, BATCH, D)))
     return variational_model.CELL, variational_model.LoopWeights(**weights), start, given
 
@@ -32,10 +32,10 @@ def vrm():
 def slac():
     """Two hidden layers in one network, one in the other."""
     first = shapes(w_z2=(D, HIDDEN), w_z1=(Z, HIDDEN), w_next_z2=(D, HIDDEN))
-    later = (jnp.zeros((HIDDEN, 7)), jnp.zeros((7, 2 * Z))), (jnp.zeros((HIDDEN, 2 * D)),)
-    given = ([jnp.zeros((TIME, BATCH, size)) for size in sizes] for sizes in ((HIDDEN, 7, 2 * Z), (HIDDEN, 2 * D)))
+    layers = [(jnp.zeros(sizes), jnp.zeros(sizes[1])) for sizes in ((HIDDEN, 7), (7, 2 * Z), (HIDDEN, 2 * D))]
+    later, given = (tuple(layers[:2]), tuple(layers[2:])), tuple(jnp.zeros((2, TIME, BATCH, HIDDEN)))
     weights = latent_model.LoopWeights(**first, posterior=later[0], next_z2=later[1])
-    return latent_model.CELL, weights, jnp.zeros((BATCH, D)), latent_model.Given(*map(tuple, given))
+    return latent_model.CELL, weights, jnp.zeros((BATCH, D)), given
 
 
 def step_by_step(cell, weights, start, given, is_first, noise):

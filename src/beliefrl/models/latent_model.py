@@ -46,22 +46,17 @@ class GaussianMLP(eqx.Module):
 
     def __call__(self, *inputs: Float[Array, "*batch _"]) -> Gaussian:
         """The Gaussian for inputs given in parts, each (*batch, size)."""
-        x = jnp.concatenate(inputs, axis=-1)
         first, *later = self.weights()
-        (mean, sigma), _ = _layers(x @ first, later, self.biases(x.shape[:-1]))
+        (mean, sigma), _ = _layers(_linear(first, jnp.concatenate(inputs, axis=-1)), later)
         return Gaussian(mean, sigma + self.least)
 
-    def weights(self) -> tuple[Float[Array, "input output"], ...]:
-        """The layers' weights, input by output."""
-        return tuple(layer.weight.T for layer in self.mlp.layers)
-
-    def biases(self, shape: tuple[int, ...]) -> tuple[Float[Array, "*batch output"], ...]:
-        """The layers' biases, each repeated over a batch of this shape."""
-        return tuple(jnp.broadcast_to(layer.bias, (*shape, *layer.bias.shape)) for layer in self.mlp.layers)
+    def weights(self) -> tuple[tuple[Float[Array, "input output"], Float[Array, " output"]], ...]:
+        """The weight, input by output, and the bias of each layer."""
+        return tuple((layer.weight.T, layer.bias) for layer in self.mlp.layers)
 
     def columns(self, *sizes: int) -> list[Float[Array, "_ hidden"]]:
         """The first layer's weights taken apart by the inputs' sizes, input by output."""
-        return jnp.split(self.weights()[0], list(itertools.accumulate(sizes))[:-1])
+        return jnp.split(self.mlp.layers[0].weight.T, list(itertools.accumulate(sizes))[:-1])
 
 
 class Latents(NamedTuple):
@@ -103,12 +98,10 @@ class LatentModel(eqx.Module):
         z1, z2 = (part.shape[-1] for part in noise)
         w_x, w_z2 = self.posterior.columns(x.shape[-1] + known.shape[-1], z2)
         w_known, w_z1, w_next_z2 = self.next_z2.columns(known.shape[-1], z1, z2)
-        first1, *later1 = self.posterior.biases(is_first.shape)
-        first2, *later2 = self.next_z2.biases(is_first.shape)
-        first1 = first1 + jnp.concatenate([x, known], axis=-1) @ w_x
-        first2 = first2 + known @ w_known
-        weights = LoopWeights(w_z2, w_z1, w_next_z2, self.posterior.weights()[1:], self.next_z2.weights()[1:])
-        given = Given((first1, *later1), (first2, *later2))
+        (_, bias1), *later1 = self.posterior.weights()
+        (_, bias2), *later2 = self.next_z2.weights()
+        given = _linear((w_x, bias1), jnp.concatenate([x, known], axis=-1)), _linear((w_known, bias2), known)
+        weights = LoopWeights(w_z2, w_z1, w_next_z2, tuple(later1), tuple(later2))
         return unroll(CELL, weights, jnp.zeros_like(noise[1][0]), given, is_first, noise)
 
 
@@ -145,33 +138,29 @@ def predict(
 
 
 class LoopWeights(NamedTuple):
-    """The weights that stay inside the loop, each (input, output)."""
+    """The weights that stay inside the loop, each (input, output); with biases those of the later layers."""
 
     w_z2: Float[Array, "z2 hidden"]  # of the posterior's first layer
     w_z1: Float[Array, "z1 hidden"]  # of the first layer of z²'s network
     w_next_z2: Float[Array, "z2 hidden"]
-    posterior: tuple[Float[Array, "input output"], ...]  # of the later layers
-    next_z2: tuple[Float[Array, "input output"], ...]
+    posterior: tuple[tuple[Float[Array, "input output"], Float[Array, " output"]], ...]
+    next_z2: tuple[tuple[Float[Array, "input output"], Float[Array, " output"]], ...]
 
 
-class Given(NamedTuple):
-    """What is added to the products of every layer, first to last; leaves (time, batch, ...)."""
-
-    posterior: tuple[Float[Array, "time batch output"], ...]
-    next_z2: tuple[Float[Array, "time batch output"], ...]
+def _linear(layer: tuple[Array, Array], x: Float[Array, "*batch input"]) -> Float[Array, "*batch output"]:
+    """A layer's output, from its weight (input, output) and its bias."""
+    product = x @ layer[0]
+    return product + jnp.broadcast_to(layer[1], product.shape)
 
 
 def _layers(
-    first: Float[Array, "*batch output"], later: Sequence[Array], added: Sequence[Array]
+    first: Float[Array, "*batch output"], later: Sequence[tuple[Array, Array]]
 ) -> tuple[Gaussian, tuple[Array, ...]]:
-    """A Gaussian and the later layers' inputs, from the first layer's product.
-
-    `later` are the later layers' weights (input, output), `added` is what is added to each layer's product.
-    """
-    x, inputs = first + added[0], []
-    for weight, bias in zip(later, added[1:], strict=True):
+    """A Gaussian and the later layers' inputs, from the first layer's output and the later layers."""
+    x, inputs = first, []
+    for layer in later:
         inputs.append(jnp.tanh(x))
-        x = inputs[-1] @ weight + bias
+        x = _linear(layer, inputs[-1])
     mean, sigma = jnp.split(x, 2, axis=-1)
     return Gaussian(mean, jax.nn.softplus(sigma)), tuple(inputs)
 
@@ -180,16 +169,16 @@ def _layers_backward(later, inputs, sigma, grad):
     """The gradients of all layers' outputs, first to last, given that of the Gaussian; the weights are transposed."""
     softplus_slope = -jnp.expm1(-sigma)  # a sigmoid, of σ = softplus(x)
     grads = [jnp.concatenate([grad.mean, grad.sigma * softplus_slope], axis=-1)]
-    for weight, x in zip(reversed(later), reversed(inputs), strict=True):
+    for (weight, _), x in zip(reversed(later), reversed(inputs), strict=True):
         grads.insert(0, (grads[0] @ weight) * (1 - x**2))
     return tuple(grads)
 
 
 def _forward(weights, before, given, noise):
     """One step: draws z¹ from its posterior, then z²."""
-    q, inputs1 = _layers(before @ weights.w_z2, weights.posterior, given.posterior)
+    q, inputs1 = _layers(given[0] + before @ weights.w_z2, weights.posterior)
     z1 = q.mean + q.sigma * noise[0]
-    p, inputs2 = _layers(z1 @ weights.w_z1 + before @ weights.w_next_z2, weights.next_z2, given.next_z2)
+    p, inputs2 = _layers(given[1] + z1 @ weights.w_z1 + before @ weights.w_next_z2, weights.next_z2)
     z2 = p.mean + p.sigma * noise[1]
     return z2, Latents(q, z1, before, z2), (inputs1, inputs2, p.sigma)
 
@@ -204,15 +193,20 @@ def _backward(weights, memory, grad_z2, grad_output):
     grad_q = Gaussian(grad_q.mean + grad_z1, grad_q.sigma + grad_z1 * memory.noise[0])
     grads1 = _layers_backward(weights.posterior, inputs1, q.sigma, grad_q)
     grad_before = grad_output.before + grads1[0] @ weights.w_z2 + grads2[0] @ weights.w_next_z2
-    return grad_before, Given(grads1, grads2)
+    return grad_before, (grads1, grads2)
 
 
-def _factors(memory, grad):
-    """What each weight in the loop multiplied, and the gradient of the product."""
+def _factors(memory, grads):
+    """The gradient of what was given; what each weight in the loop multiplied; the gradient of the product."""
     (inputs1, inputs2, _), before = memory.saved, memory.output.before
-    (first1, *later1), (first2, *later2) = grad
-    inputs = LoopWeights(before, memory.output.z1, before, inputs1, inputs2)
-    return inputs, LoopWeights(first1, first2, first2, tuple(later1), tuple(later2))
+    (first1, *later1), (first2, *later2) = grads
+    inputs = LoopWeights(before, memory.output.z1, before, _twice(inputs1), _twice(inputs2))
+    return (first1, first2), inputs, LoopWeights(first1, first2, first2, _twice(later1), _twice(later2))
+
+
+def _twice(leaves: Sequence[Array]) -> tuple[tuple[Array, Array], ...]:
+    """Each for a layer's weight and for its bias."""
+    return tuple((leaf, leaf) for leaf in leaves)
 
 
 CELL = Cell(_forward, _backward, _factors)

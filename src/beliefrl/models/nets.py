@@ -155,7 +155,7 @@ def _lstm_backward(w_d, memory, grad_state, grad_output):
 
 def _lstm_factors(memory, grad_gates):
     d_before, _ = memory.saved
-    return d_before, grad_gates
+    return grad_gates, d_before, grad_gates
 
 
 LSTM_CELL = Cell(_lstm_forward, _lstm_backward, _lstm_factors)

@@ -16,19 +16,23 @@ from jaxtyping import Array, Bool, Float
 
 
 class Cell(NamedTuple):
-    """One step of a recurrence for a batch, as three functions. Each weight is a matrix (input, output).
+    """One step of a recurrence for a batch, as three functions. Each weight is a matrix (input, output) or a bias.
+
+    Biases inside the loop are weights and no part of `given`: read at every step from a repeated array, they made the
+    unroll of VRM a third slower on the CPU (20 windows of 129 steps).
 
     forward(weights, before, given, noise) -> (state, output, saved): the next state, what `unroll` returns, and what
         the other two functions need besides.
-    backward(transposed, memory, grad_state, grad_output) -> (grad_before, grad_given): the gradient of one step;
-        `transposed` are the weights (output, input).
-    factors(memory, grad_given) -> (inputs, grad_products): what each weight multiplied and the gradient of the product,
-        each a tree like the weights, leaves (time, batch, ...).
+    backward(transposed, memory, grad_state, grad_output) -> (grad_before, grads): the gradient of one step, and the
+        gradients that `factors` needs of it; `transposed` are the weights (output, input).
+    factors(memory, grads) -> (grad_given, inputs, grad_products): for all steps, the gradient of `given`, what each
+        weight multiplied (for a bias, anything) and the gradient of the product. The last two are trees like the
+        weights, leaves (time, batch, ...).
     """
 
     forward: Callable[..., tuple[Any, Any, Any]]
     backward: Callable[..., tuple[Any, Any]]
-    factors: Callable[..., tuple[Any, Any]]
+    factors: Callable[..., tuple[Any, Any, Any]]
 
 
 class Memory(NamedTuple):
@@ -76,19 +80,22 @@ def _unroll_backward(cell, residuals, grad_output):
 
     def step(grad_state, inputs):
         memory, grad_output, is_first = inputs
-        grad_before, grad_given = cell.backward(transposed, memory, grad_state, grad_output)
-        return _reset(grad_before, is_first), grad_given
+        grad_before, grads = cell.backward(transposed, memory, grad_state, grad_output)
+        return _reset(grad_before, is_first), grads
 
     zero = jax.tree.map(jnp.zeros_like, start)
-    grad_start, grad_given = jax.lax.scan(step, zero, (memory, grad_output, is_first), reverse=True)
-    grad_weights = jax.tree.map(_product, *cell.factors(memory, grad_given))
+    grad_start, grads = jax.lax.scan(step, zero, (memory, grad_output, is_first), reverse=True)
+    grad_given, *factors = cell.factors(memory, grads)
+    grad_weights = jax.tree.map(_weight_gradient, weights, *factors)
     return grad_weights, grad_start, grad_given, None, None
 
 
-def _product(
-    inputs: Float[Array, "time batch input"], grad: Float[Array, "time batch output"]
-) -> Float[Array, "input output"]:
-    return jnp.einsum("tbm,tbn->mn", inputs, grad)
+def _weight_gradient(
+    weight: Float[Array, "..."], inputs: Float[Array, "time batch _"], grad: Float[Array, "time batch output"]
+) -> Float[Array, "..."]:
+    """The gradient of a weight, given that of its products."""
+    is_bias = weight.ndim == 1
+    return jnp.sum(grad, (0, 1)) if is_bias else jnp.einsum("tbm,tbn->mn", inputs, grad)
 
 
 unroll.defvjp(_unroll_forward, _unroll_backward)

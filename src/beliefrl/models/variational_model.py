@@ -139,9 +139,8 @@ class VRM(eqx.Module):
         given = self.joint.given(jax.vmap(jax.vmap(self.features))(x), prev_action, not self.deterministic)
         noise = jnp.zeros_like(noise) if self.deterministic else noise
         mean, sigma = self.posterior_mean, self.posterior_sigma
-        biases = (jnp.broadcast_to(layer.bias, noise.shape) for layer in (mean, sigma))
-        weights = LoopWeights(self.joint.w_d, self.joint.w_z, mean.weight.T, sigma.weight.T)
-        return unroll(CELL, weights, start, Given(given, *biases), is_first, noise)
+        weights = LoopWeights(self.joint.w_d, self.joint.w_z, mean.weight.T, sigma.weight.T, mean.bias, sigma.bias)
+        return unroll(CELL, weights, start, given, is_first, noise)
 
     def next_state(self, state: LSTMState, x: Float[Array, " x"], z: Float[Array, " z"]) -> LSTMState:
         """d_t and its cell, from d_{t-1} and its cell."""
@@ -213,29 +212,24 @@ def prediction_error(vrm: VRM, inferred: Inferred, x: Float[Array, "time batch x
 
 
 class LoopWeights(NamedTuple):
-    """The weights that stay inside the loop, each (input, output)."""
+    """The weights that stay inside the loop: (input, output), and the biases of the posterior's last layers."""
 
     w_d: Float[Array, "d joint"]
     w_z: Float[Array, "z 4*d"]
     mean: Float[Array, "hidden z"]
     sigma: Float[Array, "hidden z"]
-
-
-class Given(NamedTuple):
-    """What is added to the products in the loop; leaves (time, batch, ...)."""
-
-    joint: Float[Array, "time batch joint"]
-    mean: Float[Array, "time batch z"]
-    sigma: Float[Array, "time batch z"]
+    mean_bias: Float[Array, " z"]
+    sigma_bias: Float[Array, " z"]
 
 
 def _forward(weights, before, given, noise):
     """One step: prepares the posterior's hidden layers and the gates, draws z, and moves the LSTM."""
     hidden = weights.mean.shape[0]
-    joint = given.joint + before.d @ weights.w_d
+    joint = given + before.d @ weights.w_d
     first = jnp.tanh(joint[:, : 2 * hidden])
-    mean = given.mean + first[:, :hidden] @ weights.mean
-    sigma = jax.nn.softplus(given.sigma + first[:, hidden:] @ weights.sigma)
+    bias_mean, bias_sigma = (jnp.broadcast_to(b, noise.shape) for b in (weights.mean_bias, weights.sigma_bias))
+    mean = first[:, :hidden] @ weights.mean + bias_mean
+    sigma = jax.nn.softplus(first[:, hidden:] @ weights.sigma + bias_sigma)
     z = mean + sigma * noise
     state, slopes = lstm_step(joint[:, 2 * hidden :] + z @ weights.w_z, before.c)
     return state, Inferred(Gaussian(mean, sigma), z, before.d, state), (first, slopes)
@@ -252,15 +246,17 @@ def _backward(weights, memory, grad_state, grad_output):
     grad_hidden = jnp.concatenate([grad_mean @ weights.mean, grad_sigma @ weights.sigma], axis=-1)
     grad_joint = jnp.concatenate([grad_hidden * (1 - first**2), grad_gates], axis=-1)
     grad_d = grad_output.before + grad_joint @ weights.w_d
-    return LSTMState(grad_d, grad_c), Given(grad_joint, grad_mean, grad_sigma)
+    return LSTMState(grad_d, grad_c), (grad_joint, grad_mean, grad_sigma)
 
 
-def _factors(memory, grad):
-    """What each weight in the loop multiplied, and the gradient of the product."""
+def _factors(memory, grads):
+    """The gradient of what was given; what each weight in the loop multiplied; the gradient of the product."""
+    grad_joint, grad_mean, grad_sigma = grads
     hidden_mean, hidden_sigma = jnp.split(memory.saved[0], 2, axis=-1)
-    inputs = LoopWeights(memory.output.before, memory.output.z, hidden_mean, hidden_sigma)
-    grad_gates = grad.joint[..., 2 * hidden_mean.shape[-1] :]
-    return inputs, LoopWeights(grad.joint, grad_gates, grad.mean, grad.sigma)
+    before, z = memory.output.before, memory.output.z
+    inputs = LoopWeights(before, z, hidden_mean, hidden_sigma, hidden_mean, hidden_sigma)
+    grad_gates = grad_joint[..., 2 * hidden_mean.shape[-1] :]
+    return grad_joint, inputs, LoopWeights(grad_joint, grad_gates, grad_mean, grad_sigma, grad_mean, grad_sigma)
 
 
 CELL = Cell(_forward, _backward, _factors)
