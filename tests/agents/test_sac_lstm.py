@@ -9,7 +9,7 @@ import pytest
 
 from agents.moments import SPEC, along, changed_where_missing, differ, random_like, slope, windows
 from beliefrl.agents.sac_lstm import SACLSTMAgent
-from beliefrl.models.nets import LSTM, LSTMState, _lstm_loop, _lstm_scan, draw
+from beliefrl.models.nets import LSTM, draw
 from beliefrl.models.soft_actor_critic import actor_loss, q_loss, state_value, value_loss
 from beliefrl.types import UserError
 
@@ -40,23 +40,6 @@ def test_the_lstm_is_the_textbooks():
         d = sigmoid(o) * np.tanh(c)
         np.testing.assert_allclose(ours.d[t], d, rtol=1e-4, atol=1e-6)
         np.testing.assert_allclose(ours.c[t], c, rtol=1e-4, atol=1e-6)
-
-
-def test_the_loops_gradient_is_that_of_plain_differentiation():
-    lstm = draw(jax.random.key(0), LSTM(3, 4))
-    start = LSTMState(*jax.random.normal(jax.random.key(1), (2, 3, 4)))
-    given = jax.random.normal(jax.random.key(2), (5, 3, 16))
-    is_first = jnp.zeros((5, 3), bool).at[2, 1].set(True)
-
-    def probe(function, *args):
-        leaves = jax.tree.leaves(function(*args, is_first))
-        return sum(jnp.sum(leaf * jax.random.normal(jax.random.key(i), leaf.shape)) for i, leaf in enumerate(leaves))
-
-    gradients = [
-        jax.jit(jax.grad(lambda *args, f=f: probe(f, *args), (0, 1, 2)))(lstm.w_d, start, given)
-        for f in (_lstm_loop, _lstm_scan)
-    ]
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), *gradients)
 
 
 def test_acting_forms_the_belief_that_replay_forms(state):

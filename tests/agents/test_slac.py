@@ -7,7 +7,7 @@ import pytest
 
 from agents.moments import SPEC, along, changed_where_missing, differ, random_like, same, slope, windows
 from beliefrl.agents.slac import SLACAgent, begin_windows
-from beliefrl.models.latent_model import _loop, _scan, _zeros, elbo_terms
+from beliefrl.models.latent_model import elbo_terms
 from beliefrl.types import UserError, perception
 
 AGENT = SLACAgent(
@@ -89,32 +89,6 @@ def test_inference_and_elbo_are_the_equations(state, moments, noise):
         ):
             np.testing.assert_allclose(mine, theirs, rtol=1e-4, atol=1e-5)
         z1_before, before = z1, z2
-
-
-def test_the_loops_gradient_is_that_of_plain_differentiation(state, moments, noise):
-    captured = {}
-
-    def capture(weights, given, is_first, noise):
-        captured.update(weights=weights, given=given)
-        return _loop(weights, given, is_first, noise)
-
-    step = moments.step
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("beliefrl.models.latent_model._loop", capture)
-        state.model.infer(perception(step), step.prev_action, step.is_first, noise)
-
-    def plain(weights, given, is_first, noise):
-        return _scan(weights, given, _zeros(weights, is_first.shape), is_first, noise)[0]
-
-    def probe(function, weights, given):
-        leaves = jax.tree.leaves(function(weights, given, step.is_first, noise))
-        return sum(jnp.sum(leaf * jax.random.normal(jax.random.key(i), leaf.shape)) for i, leaf in enumerate(leaves))
-
-    gradients = [
-        jax.jit(jax.grad(lambda *args, f=f: probe(f, *args), (0, 1)))(captured["weights"], captured["given"])
-        for f in (_loop, plain)
-    ]
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), *gradients)
 
 
 @pytest.mark.slow

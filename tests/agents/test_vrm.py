@@ -11,8 +11,8 @@ import pytest
 from agents.moments import SMALL, SPEC, differ, same
 from beliefrl import agents
 from beliefrl.agents.vrm import VRMAgent
-from beliefrl.models.nets import draw, initial_statistics, standardise
-from beliefrl.models.variational_model import VRM, Gaussian, LSTMState, VRMLoopWeights, _loop, _scan
+from beliefrl.models.nets import initial_statistics, standardise
+from beliefrl.models.variational_model import VRM
 from beliefrl.types import Timestep, UserError, Window, check_choice
 
 AGENT = VRMAgent(**SMALL)
@@ -253,28 +253,3 @@ def test_decoding_from_the_prior_and_sums_are_other_losses(state):
     assert float(prior["log_likelihood"]) != pytest.approx(float(mean["log_likelihood"]), rel=1e-3)
     assert float(total["kl"]) == pytest.approx(float(mean["kl"]) * AGENT.z_size, rel=1e-4)
     assert float(total["log_likelihood"]) == pytest.approx(float(mean["log_likelihood"]) * 4, rel=1e-4)
-
-
-def test_the_loops_gradient_is_that_of_plain_differentiation():
-    vrm = draw(jax.random.key(0), VRM(4, 2, 8, 4, 8))
-    weights = VRMLoopWeights(vrm.joint.w_d, vrm.joint.w_z, vrm.posterior_mean, vrm.posterior_sigma)
-    start = LSTMState(*jax.random.normal(jax.random.key(1), (2, 3, 8)))
-    given = jax.random.normal(jax.random.key(2), (5, 3, 2 * 8 + 4 * 8))
-    is_first = jnp.zeros((5, 3), bool).at[2, 1].set(True)
-    noise = jax.random.normal(jax.random.key(3), (5, 3, 4))
-
-    def probe(inferred):
-        leaves = jax.tree.leaves(inferred)
-        return sum(jnp.sum(leaf * jax.random.normal(jax.random.key(i), leaf.shape)) for i, leaf in enumerate(leaves))
-
-    def plain(*args):
-        return _scan(*args[:3], Gaussian(jnp.zeros_like(noise), jnp.zeros_like(noise)), is_first, noise)[0]
-
-    def ours(*args):
-        return _loop(*args, is_first, noise)
-
-    gradients = [
-        jax.jit(jax.grad(lambda *args, f=f: probe(f(*args)), argnums=(0, 1, 2)))(weights, start, given)
-        for f in (ours, plain)
-    ]
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), *gradients)

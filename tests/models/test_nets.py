@@ -5,12 +5,14 @@ import pytest
 
 from beliefrl.models.nets import (
     MLP,
+    LSTMState,
     RunningStatistics,
     draw,
     gaussian_kl,
     gaussian_log_prob,
     initial_statistics,
-    lstm_state,
+    lstm_step,
+    lstm_step_backward,
     standardise,
     tanh_gaussian,
     update_statistics,
@@ -21,28 +23,25 @@ def sigmoid(x):
     return 1 / (1 + np.exp(-x))
 
 
-def test_lstm_state_is_the_textbook_cell():
+def test_lstm_step_is_the_textbook_cell():
     gates, c = jax.random.normal(jax.random.key(0), (5, 12)) * 3, jax.random.normal(jax.random.key(1), (5, 3))
     i, f, g, o = np.split(np.array(gates, np.float64), 4, axis=-1)
     c_next = sigmoid(f) * np.array(c) + sigmoid(i) * np.tanh(g)
-    ours = lstm_state(gates, c)
-    np.testing.assert_allclose(ours[1], c_next, rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(ours[0], sigmoid(o) * np.tanh(c_next), rtol=1e-5, atol=1e-6)
+    ours, _ = lstm_step(gates, c)
+    np.testing.assert_allclose(ours.c, c_next, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(ours.d, sigmoid(o) * np.tanh(c_next), rtol=1e-5, atol=1e-6)
 
 
-def test_lstm_state_has_the_gradient_of_the_textbook_cell():
+def test_lstm_step_has_the_gradient_of_the_textbook_cell():
     def textbook(gates, c):
         i, f, g, o = jnp.split(gates, 4, axis=-1)
         c = jax.nn.sigmoid(f) * c + jax.nn.sigmoid(i) * jnp.tanh(g)
-        return jax.nn.sigmoid(o) * jnp.tanh(c), c
-
-    def probe(cell):
-        return lambda gates, c: sum(
-            jnp.sum(weight * out) for weight, out in zip((1.3, 0.7), cell(gates, c), strict=True)
-        )
+        return LSTMState(jax.nn.sigmoid(o) * jnp.tanh(c), c)
 
     gates, c = jax.random.normal(jax.random.key(0), (2, 12)), jax.random.normal(jax.random.key(1), (2, 3))
-    ours, theirs = (jax.jit(jax.grad(probe(cell), (0, 1)))(gates, c) for cell in (lstm_state, textbook))
+    grad = LSTMState(*jax.random.normal(jax.random.key(2), (2, 2, 3)))
+    ours = lstm_step_backward(lstm_step(gates, c)[1], grad)
+    theirs = jax.vjp(textbook, gates, c)[1](grad)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), ours, theirs)
 
 

@@ -66,7 +66,7 @@ class SACAgent:
         check_range(self, ("n_step",), 1, MOST_STEPS)
         check_range(self, ("value_start",), -LARGEST)
         check_range(self, ("actor_regulariser",), 0)
-        check_range(self, ("step_start_rl",), 2)  # fewer moments hold no transition
+        check_range(self, ("step_start_rl",), 2)  # fewer timesteps hold no transition
         check_range(self, ("lr_actor", "lr_critic", "lr_alpha", "gamma", "tau"), 0, 1)
         if self.target_entropy is not None:
             check_range(self, ("target_entropy",), -LARGEST)
@@ -136,8 +136,8 @@ class SACAgent:
 
         Args:
             windows: as the replay returns them.
-            belief: at the length + 1 moments after the burn-in.
-            next_belief: what V̄ reads at these moments; None: `belief`.
+            belief: at the length + 1 timesteps after the burn-in.
+            next_belief: what V̄ reads at these timesteps; None: `belief`.
             actor_input: what the actor reads there; None: `belief`.
         """
         burn_in = self.window.burn_in

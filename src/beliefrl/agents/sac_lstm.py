@@ -157,7 +157,9 @@ class SACLSTMAgent(SACAgent):
         d_target = self.beliefs(target_lstm, windows)
         d, pullback = jax.vjp(lambda lstm: self.beliefs(lstm, windows), lstm)
         (grad_d, grad_d_actor, grad_controller), metrics = jax.grad(loss, (0, 1, 2), has_aux=True)(d, d, controller)
-        return (*pullback(grad_d), *pullback(grad_d_actor), grad_controller), metrics
+        (grads,) = jax.vmap(pullback)(jnp.stack([grad_d, grad_d_actor]))  # one scan back for both
+        grad_critics, grad_actor = (jax.tree.map(lambda leaf, i=i: leaf[i], grads) for i in range(2))
+        return (grad_critics, grad_actor, grad_controller), metrics
 
     def update(self, state: State, batch: Window, key: Key[Array, ""]) -> tuple[State, Metrics]:
         """One update of the LSTM and the controller; the batch is windows."""

@@ -4,10 +4,10 @@ Source: Lee et al. 2019, Sections 4 and 5; Han, Doya, Tani 2020, Section 5 and A
 (`latent_model`) is pre-trained and then learns at every step. Q and V read z²_t, the actor the last eight
 x_t = (o_t, r_{t-1}), in which an episode's first stands for what was before it.
 
-Departures: z²_t is inferred from four moments before a sampled sequence on, so that the critics' beliefs rest on 5 to
-12 moments; Lee et al. take one transition from each sequence, behind 8. The beliefs of an update are inferred with the
-model as it was before its own update of that step, so that the two can run side by side. Those of the model itself
-are in `latent_model`.
+Departures: z²_t is inferred from four timesteps before a sampled sequence on, so that the critics' beliefs rest on 5 to
+12 timesteps; Lee et al. take one transition from each sequence, behind 8. The beliefs of an update are inferred with
+the model as it was before its own update of that step, so that the two can run side by side. The model's own
+departures are in `latent_model`.
 """
 
 import dataclasses
@@ -22,17 +22,7 @@ from beliefrl.agents.base import Metrics, SACAgent, split_updates
 from beliefrl.models.latent_model import LatentModel, Latents, elbo_terms, predict
 from beliefrl.models.nets import Gaussian, descend, draw
 from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean
-from beliefrl.types import (
-    WIDEST,
-    Spec,
-    Timestep,
-    UserError,
-    Window,
-    WindowShape,
-    check_choice,
-    check_range,
-    perception,
-)
+from beliefrl.types import WIDEST, Spec, Timestep, UserError, Window, WindowShape, check_choice, check_range, perception
 
 
 class State(NamedTuple):
@@ -167,22 +157,22 @@ class SLACAgent(SACAgent):
         return state._replace(model=model, model_optimiser=optimiser), metrics
 
     def model_loss(self, model: LatentModel, windows: Window, key: Key[Array, ""]) -> tuple[Float[Array, ""], Metrics]:
-        """The negative ELBO, mean over the valid moments of the sequences."""
-        moments = begin_windows(windows.between(self.history - 1, -1))
-        step = moments.step
-        latents = self.infer(model, moments, key)
+        """The negative ELBO, mean over the valid timesteps of the sequences."""
+        windows = begin_windows(windows.between(self.history - 1, -1))
+        step = windows.step
+        latents = self.infer(model, windows, key)
         terms = elbo_terms(model, latents, step.obs, step.reward, step.prev_action, step.is_first)
-        kl, log_obs, log_reward = (valid_mean(term.ravel(), moments.exists.ravel()) for term in terms)
+        kl, log_obs, log_reward = (valid_mean(term.ravel(), windows.exists.ravel()) for term in terms)
         log_likelihood = log_obs + log_reward
         if self.elbo_scaling == "mean":
             kl, log_likelihood = kl / self.z1_size, log_likelihood / (step.obs.shape[-1] + 1)
         metrics = {"kl": kl, "log_likelihood": log_likelihood, "negative_elbo": kl - log_likelihood}
         return kl - log_likelihood, metrics
 
-    def infer(self, model: LatentModel, moments: Window, key: Key[Array, ""]) -> Latents:
-        """The latent variables at moments (time-major)."""
+    def infer(self, model: LatentModel, windows: Window, key: Key[Array, ""]) -> Latents:
+        """The latent variables along windows (time-major)."""
         key1, key2 = jax.random.split(key)
-        shape, step = moments.exists.shape, moments.step
+        shape, step = windows.exists.shape, windows.step
         noise = jax.random.normal(key1, (*shape, self.z1_size)), jax.random.normal(key2, (*shape, self.z2_size))
         return model.infer(perception(step), step.prev_action, step.is_first, noise)
 
@@ -205,9 +195,9 @@ class SLACAgent(SACAgent):
         return split_updates(batch, self.batch_size)
 
     def histories(self, step: Timestep) -> Float[Array, "length batch actor_input"]:
-        """The actor's input at each moment after the burn-in of windows (time-major)."""
+        """The actor's input at each timestep after the burn-in of windows (time-major)."""
         x, time = perception(step), jnp.arange(step.reward.shape[0])
-        begun = jax.lax.cummax(jnp.where(step.is_first, time[:, None], 0))  # when the moment's episode began
+        begun = jax.lax.cummax(jnp.where(step.is_first, time[:, None], 0))  # when the timestep's episode began
         back = time[self.history - 1 :, None] - jnp.arange(self.history)[::-1][None]
         index = jnp.maximum(back[:, :, None], begun[self.history - 1 :, None])  # (length, history, batch)
         actor_input = x[index, jnp.arange(x.shape[1])].swapaxes(1, 2)
@@ -218,8 +208,8 @@ class SLACAgent(SACAgent):
         return state._replace(controller=controller, controller_optimiser=optimiser), metrics
 
 
-def begin_windows(moments: Window) -> Window:
-    """Windows (time-major) whose first moment counts as an episode's first: nothing was before it."""
-    step = moments.step
+def begin_windows(windows: Window) -> Window:
+    """Windows (time-major) whose first timestep counts as an episode's first."""
+    step = windows.step
     step = step._replace(is_first=step.is_first.at[0].set(True), prev_action=step.prev_action.at[0].set(0.0))
-    return moments._replace(step=step)
+    return windows._replace(step=step)

@@ -25,17 +25,7 @@ from beliefrl.agents.base import Metrics, SACAgent, split_updates, standardise_b
 from beliefrl.models.nets import Gaussian, LSTMState, RunningStatistics, descend, draw, initial_statistics, standardise
 from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean
 from beliefrl.models.variational_model import VRM, elbo_terms, predict, prediction_error
-from beliefrl.types import (
-    WIDEST,
-    Spec,
-    Timestep,
-    UserError,
-    Window,
-    WindowShape,
-    check_choice,
-    check_range,
-    perception,
-)
+from beliefrl.types import WIDEST, Spec, Timestep, UserError, Window, WindowShape, check_choice, check_range, perception
 
 
 class Memory(NamedTuple):
@@ -184,13 +174,13 @@ class VRMAgent(SACAgent):
     def perceive(
         self, vrm: VRM | None, memory: LSTMState | None, step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]
     ) -> LSTMState | None:
-        """One model's state after one more moment."""
+        """One model's state after one more timestep."""
         if vrm is None:
             return None
         noise = jnp.where(explore & self.sample_belief, jax.random.normal(key, (self.z_size,)), 0.0)
         start = jax.tree.map(lambda leaf: leaf[None], memory)
-        moment = (perception(step), step.prev_action, step.is_first, noise)
-        inferred = vrm.infer(start, *(leaf[None, None] for leaf in moment))
+        inputs = (perception(step), step.prev_action, step.is_first, noise)
+        inferred = vrm.infer(start, *(leaf[None, None] for leaf in inputs))
         return jax.tree.map(lambda leaf: leaf[0, 0], inferred.state)
 
     def act(
@@ -239,12 +229,12 @@ class VRMAgent(SACAgent):
     def learn_model(
         self, vrm: VRM, optimiser: optax.OptState, windows: Window, key: Key[Array, ""]
     ) -> tuple[VRM, optax.OptState, Metrics]:
-        """One Adam step on the negative ELBO of `seq_len` moments after the burn-in."""
+        """One Adam step on the negative ELBO of `seq_len` timesteps after the burn-in."""
         grads, metrics = jax.grad(self.model_loss, has_aux=True)(vrm, windows, key)
         return *descend(self.model_optimiser, grads, optimiser, vrm), metrics
 
     def model_loss(self, vrm: VRM, windows: Window, key: Key[Array, ""]) -> tuple[Float[Array, ""], Metrics]:
-        """The negative ELBO (the squared error of deterministic models), mean over the valid moments after burn-in."""
+        """The negative ELBO (squared error of deterministic models), mean over the valid timesteps after burn-in."""
         key_burn_in, key_infer, key_prior = jax.random.split(key, 3)
         before, after = windows.between(0, self.burn_in), windows.between(self.burn_in, -1)
         start = vrm.start(self.batch_size)
@@ -265,7 +255,7 @@ class VRMAgent(SACAgent):
         return kl - log_likelihood, {"kl": kl, "log_likelihood": log_likelihood, "negative_elbo": kl - log_likelihood}
 
     def unroll(self, vrm: VRM, windows: Window, noise: Float[Array, "time batch z"]) -> LSTMState:
-        """A model's states at moments (time-major) that begin with the empty state; leaves (time, batch, d)."""
+        """A model's states along windows (time-major), from the empty state; leaves (time, batch, d)."""
         step, start = windows.step, vrm.start(windows.exists.shape[1])
         return vrm.infer(start, perception(step), step.prev_action, step.is_first, noise).state
 

@@ -1,21 +1,20 @@
-"""SLAC's latent variable model: two latent variables a moment, z¹ inferred from the perception, z² a memory of it.
+"""SLAC's latent variable model: two latent variables at each timestep, z¹ inferred from x_t, z² from z¹.
 
 Source: Lee et al. 2019, Section 4; sizes and activations: Han, Doya, Tani 2020, Appendix A.2.3. With
 x_t = (o_t, r_{t-1}) and z_t = [z¹_t, z²_t]:
 
     posterior  q(z¹_t) = N(μ, σ)[x_t, z²_{t-1}, a_{t-1}]
-    prior      p(z¹_t) = N(μ, σ)[z²_{t-1}, a_{t-1}], and N(0, 1) at an episode's first moment
+    prior      p(z¹_t) = N(μ, σ)[z²_{t-1}, a_{t-1}], and N(0, 1) at an episode's first timestep
     both       p(z²_t) = N(μ, σ)[z¹_t, z²_{t-1}, a_{t-1}]
     decoders   p(o_t)  = N(μ, σ)[z_t],    p(r_{t-1}) = N(μ, σ)[z_{t-1}, a_{t-1}, z_t]
     ELBO               = Σ_t log p(o_t) + log p(r_{t-1}) - D_KL(q(z¹_t) ‖ p(z¹_t))
 
 Speed decides the form: the products of the first layers with what does not come out of the loop are taken before it,
-prior and decoders run after it, and the gradient of a weight inside the loop is one product after it
-(`_loop_backward`).
+and prior and decoders run after it. The loop and its gradient are those of `recurrence`.
 
 Departures: perceptrons for convolutions, tanh, and a learned σ of the decoders, as Han et al. have it; μ and σ are two
-outputs of one perceptron, as Lee et al. have it (Han et al. have a perceptron for each, at twice the cost); and at an
-episode's first moment the same networks are used, with an input that marks it and zeros for z²_{t-1} and a_{t-1}, where
+outputs of one perceptron, as Lee et al. have it (Han et al. have a perceptron for each, at twice the cost); and an
+episode's first timestep uses the same networks, with an input that marks it and zeros for z²_{t-1} and a_{t-1}, where
 both papers have further networks.
 """
 
@@ -29,6 +28,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from beliefrl.models.nets import MLP, Gaussian, gaussian_kl, gaussian_log_prob
+from beliefrl.models.recurrence import Cell, unroll
 
 SIGMA_MIN = 1e-2  # of the decoders
 
@@ -46,31 +46,17 @@ class GaussianMLP(eqx.Module):
 
     def __call__(self, *inputs: Float[Array, "*batch _"]) -> Gaussian:
         """The Gaussian for inputs given in parts, each (*batch, size)."""
-        first = self.mlp.layers[0]
-        return self.rest(_add(jnp.concatenate(inputs, axis=-1) @ first.weight.T, first.bias))[0]
+        first, *later = self.weights()
+        (mean, sigma), _ = _layers(_linear(first, jnp.concatenate(inputs, axis=-1)), later)
+        return Gaussian(mean, sigma + self.least)
 
-    def rest(
-        self, first: Float[Array, "*batch hidden"], zeros: Sequence[Array] | None = None
-    ) -> tuple[Gaussian, tuple[Array, ...]]:
-        """The Gaussian from what the first layer gave, and what each later layer was given.
-
-        `zeros` are added to the later layers' outputs: their cotangents are those of the outputs.
-        """
-        x, inputs = first, []
-        for index, layer in enumerate(self.mlp.layers[1:]):
-            inputs.append(jnp.tanh(x))
-            x = _add(inputs[-1] @ layer.weight.T, layer.bias)
-            x = x if zeros is None else x + zeros[index]
-        mean, sigma = jnp.split(x, 2, axis=-1)
-        return Gaussian(mean, jax.nn.softplus(sigma) + self.least), tuple(inputs)
+    def weights(self) -> tuple[tuple[Float[Array, "input output"], Float[Array, " output"]], ...]:
+        """The weight, input by output, and the bias of each layer."""
+        return tuple((layer.weight.T, layer.bias) for layer in self.mlp.layers)
 
     def columns(self, *sizes: int) -> list[Float[Array, "_ hidden"]]:
         """The first layer's weights taken apart by the inputs' sizes, input by output."""
         return jnp.split(self.mlp.layers[0].weight.T, list(itertools.accumulate(sizes))[:-1])
-
-
-def _add(x: Float[Array, "*batch size"], bias: Float[Array, " size"]) -> Float[Array, "*batch size"]:
-    return x + jnp.broadcast_to(bias, x.shape)
 
 
 class Latents(NamedTuple):
@@ -93,7 +79,7 @@ class LatentModel(eqx.Module):
 
     def __init__(self, obs: int, action: int, z1: int, z2: int, layers: tuple[int, ...]):
         """Widths: observation, action, both latent variables, and the hidden layers of every network."""
-        known = 1 + action  # whether it is the first moment, and a_{t-1}
+        known = 1 + action  # whether it is the first timestep, and a_{t-1}
         self.posterior = GaussianMLP(obs + 1 + known + z2, layers, z1)
         self.prior = GaussianMLP(z2 + action, layers, z1)
         self.next_z2 = GaussianMLP(known + z1 + z2, layers, z2)
@@ -112,10 +98,11 @@ class LatentModel(eqx.Module):
         z1, z2 = (part.shape[-1] for part in noise)
         w_x, w_z2 = self.posterior.columns(x.shape[-1] + known.shape[-1], z2)
         w_known, w_z1, w_next_z2 = self.next_z2.columns(known.shape[-1], z1, z2)
-        given1 = _add(jnp.concatenate([x, known], axis=-1) @ w_x, self.posterior.mlp.layers[0].bias)
-        given2 = _add(known @ w_known, self.next_z2.mlp.layers[0].bias)
-        weights = LatentLoopWeights(w_z2, w_z1, w_next_z2, self.posterior, self.next_z2)
-        return _loop(weights, (given1, given2), is_first, noise)
+        (_, bias1), *later1 = self.posterior.weights()
+        (_, bias2), *later2 = self.next_z2.weights()
+        given = _linear((w_x, bias1), jnp.concatenate([x, known], axis=-1)), _linear((w_known, bias2), known)
+        weights = LoopWeights(w_z2, w_z1, w_next_z2, tuple(later1), tuple(later2))
+        return unroll(CELL, weights, jnp.zeros_like(noise[1][0]), given, is_first, noise)
 
 
 def predict(
@@ -125,10 +112,10 @@ def predict(
     observed: Bool[Array, " time"],
     noise: tuple[Float[Array, "time z1"], Float[Array, "time z2"]],
 ) -> Gaussian:
-    """p(x_t | z_{t-1}, a_{t-1}, z_t) along one episode from its first moment on, leaves (time, x).
+    """p(x_t | z_{t-1}, a_{t-1}, z_t) along one episode from its first timestep on, leaves (time, x).
 
     Where x_t is `observed`, z¹_t is drawn from the posterior: open loop. Where it is not, z¹_t is drawn from the prior:
-    closed loop. The first moment comes with no reward: NaN stands there.
+    closed loop. The first timestep has no reward: its entries are NaN.
     """
     is_first = jnp.arange(len(observed)) == 0
 
@@ -150,87 +137,87 @@ def predict(
     return jax.lax.scan(step, start, (x, prev_action, is_first, observed, noise))[1]
 
 
-class LatentLoopWeights(NamedTuple):
-    """The weights that stay inside the loop; of the two networks only what is behind their first layers."""
+class LoopWeights(NamedTuple):
+    """The weights that stay inside the loop, each (input, output); with biases those of the later layers."""
 
-    w_z2: Float[Array, "z2 hidden"]
-    w_z1: Float[Array, "z1 hidden"]
+    w_z2: Float[Array, "z2 hidden"]  # of the posterior's first layer
+    w_z1: Float[Array, "z1 hidden"]  # of the first layer of z²'s network
     w_next_z2: Float[Array, "z2 hidden"]
-    posterior: GaussianMLP
-    next_z2: GaussianMLP
+    posterior: tuple[tuple[Float[Array, "input output"], Float[Array, " output"]], ...]
+    next_z2: tuple[tuple[Float[Array, "input output"], Float[Array, " output"]], ...]
 
 
-def _cell(weights, before, given, zeros, is_first, noise):
-    """One moment: the latent variables, and what each later layer of both networks was given."""
-    before = jnp.where(is_first[:, None], 0.0, before)
-    q, inputs1 = weights.posterior.rest(given[0] + before @ weights.w_z2, zeros[0])
+def _linear(layer: tuple[Array, Array], x: Float[Array, "*batch input"]) -> Float[Array, "*batch output"]:
+    """A layer's output, from its weight (input, output) and its bias."""
+    product = x @ layer[0]
+    return product + jnp.broadcast_to(layer[1], product.shape)
+
+
+def _layers(
+    first: Float[Array, "*batch output"], later: Sequence[tuple[Array, Array]]
+) -> tuple[Gaussian, tuple[Array, ...]]:
+    """A Gaussian and the later layers' inputs, from the first layer's output and the later layers."""
+    x, inputs = first, []
+    for layer in later:
+        inputs.append(jnp.tanh(x))
+        x = _linear(layer, inputs[-1])
+    mean, sigma = jnp.split(x, 2, axis=-1)
+    return Gaussian(mean, jax.nn.softplus(sigma)), tuple(inputs)
+
+
+def _layers_backward(later, inputs, sigma, grad):
+    """The gradients of all layers' outputs, first to last, given that of the Gaussian; the weights are transposed."""
+    softplus_slope = -jnp.expm1(-sigma)  # a sigmoid, of σ = softplus(x)
+    grads = [jnp.concatenate([grad.mean, grad.sigma * softplus_slope], axis=-1)]
+    for (weight, _), x in zip(reversed(later), reversed(inputs), strict=True):
+        grads.insert(0, (grads[0] @ weight) * (1 - x**2))
+    return tuple(grads)
+
+
+def _forward(weights, before, given, noise):
+    """One step: draws z¹ from its posterior, then z²."""
+    q, inputs1 = _layers(given[0] + before @ weights.w_z2, weights.posterior)
     z1 = q.mean + q.sigma * noise[0]
-    p, inputs2 = weights.next_z2.rest(given[1] + z1 @ weights.w_z1 + before @ weights.w_next_z2, zeros[1])
+    p, inputs2 = _layers(given[1] + z1 @ weights.w_z1 + before @ weights.w_next_z2, weights.next_z2)
     z2 = p.mean + p.sigma * noise[1]
-    return z2, (Latents(q, z1, before, z2), (inputs1, inputs2))
+    return z2, Latents(q, z1, before, z2), (inputs1, inputs2, p.sigma)
 
 
-def _scan(weights, given, zeros, is_first, noise):
-    def step(before, inputs):
-        return _cell(weights, before, *inputs)
-
-    return jax.lax.scan(step, jnp.zeros_like(noise[1][0]), (given, zeros, is_first, noise))[1]
-
-
-def _zeros(weights, shape):
-    """What is added to the outputs of the later layers."""
-    networks = (weights.posterior, weights.next_z2)
-    return tuple(
-        tuple(jnp.zeros((*shape, layer.bias.shape[0])) for layer in network.mlp.layers[1:]) for network in networks
-    )
+def _backward(weights, memory, grad_z2, grad_output):
+    """The gradient of one step; the weights are transposed."""
+    inputs1, inputs2, sigma_z2 = memory.saved
+    grad_z2 = grad_z2 + grad_output.z2
+    grads2 = _layers_backward(weights.next_z2, inputs2, sigma_z2, Gaussian(grad_z2, grad_z2 * memory.noise[1]))
+    grad_z1 = grad_output.z1 + grads2[0] @ weights.w_z1
+    q, grad_q = memory.output.posterior, grad_output.posterior
+    grad_q = Gaussian(grad_q.mean + grad_z1, grad_q.sigma + grad_z1 * memory.noise[0])
+    grads1 = _layers_backward(weights.posterior, inputs1, q.sigma, grad_q)
+    grad_before = grad_output.before + grads1[0] @ weights.w_z2 + grads2[0] @ weights.w_next_z2
+    return grad_before, (grads1, grads2)
 
 
-@jax.custom_vjp
-def _loop(weights, given, is_first, noise) -> Latents:
-    return _scan(weights, given, _zeros(weights, is_first.shape), is_first, noise)[0]
+def _factors(memory, grads):
+    """The gradient of what was given; what each weight in the loop multiplied; the gradient of the product."""
+    (inputs1, inputs2, _), before = memory.saved, memory.output.before
+    (first1, *later1), (first2, *later2) = grads
+    inputs = LoopWeights(before, memory.output.z1, before, _twice(inputs1), _twice(inputs2))
+    return (first1, first2), inputs, LoopWeights(first1, first2, first2, _twice(later1), _twice(later2))
 
 
-def _loop_forward(weights, given, is_first, noise):
-    zeros = _zeros(weights, is_first.shape)
-    (latents, inputs), pullback = jax.vjp(
-        lambda given, zeros: _scan(weights, given, zeros, is_first, noise), given, zeros
-    )
-    return latents, (weights, latents, inputs, pullback)
+def _twice(leaves: Sequence[Array]) -> tuple[tuple[Array, Array], ...]:
+    """Each for a layer's weight and for its bias."""
+    return tuple((leaf, leaf) for leaf in leaves)
 
 
-def _loop_backward(saved, cotangent):
-    weights, latents, inputs, pullback = saved
-    grad_given, grad_outputs = pullback((cotangent, jax.tree.map(jnp.zeros_like, inputs)))
-
-    def product(left, right):
-        return jnp.einsum("tbm,tbn->mn", left, right)
-
-    def gradient(network, inputs, grad_outputs):
-        first = network.mlp.layers[0]  # its gradient goes by the other entries
-        grad_layers = [jnp.zeros_like(first.weight), jnp.zeros_like(first.bias)]
-        for x, grad_output in zip(inputs, grad_outputs, strict=True):
-            grad_layers += [product(grad_output, x), jnp.sum(grad_output, (0, 1))]
-        return eqx.tree_at(lambda network: jax.tree.leaves(network.mlp.layers), network, grad_layers)
-
-    grad_weights = LatentLoopWeights(
-        product(latents.before, grad_given[0]),
-        product(latents.z1, grad_given[1]),
-        product(latents.before, grad_given[1]),
-        gradient(weights.posterior, inputs[0], grad_outputs[0]),
-        gradient(weights.next_z2, inputs[1], grad_outputs[1]),
-    )
-    return grad_weights, grad_given, None, None
-
-
-_loop.defvjp(_loop_forward, _loop_backward)
+CELL = Cell(_forward, _backward, _factors)
 
 
 class LatentElboTerms(NamedTuple):
-    """The terms of the ELBO at every moment, summed over dimensions."""
+    """The terms of the ELBO at every timestep, summed over dimensions."""
 
     kl: Float[Array, "time batch"]
     log_obs: Float[Array, "time batch"]
-    log_reward: Float[Array, "time batch"]  # of the reward before the moment; 0 where there was none
+    log_reward: Float[Array, "time batch"]  # of r_{t-1}; 0 at an episode's first timestep
 
 
 def elbo_terms(

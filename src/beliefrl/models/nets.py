@@ -15,6 +15,8 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
+from beliefrl.models.recurrence import Cell, unroll
+
 LOG_2PI = 1.8378770664093453
 
 # Keeps the log-probability of a squashed action finite at ±1, as in the authors' code. It also takes the gradient of
@@ -79,44 +81,39 @@ class LSTMState(NamedTuple):
     c: Float[Array, "*batch d"]  # its cell
 
 
-@jax.custom_vjp
-def lstm_state(gates: Float[Array, "*lead gates"], c: Float[Array, "*lead d"]) -> tuple[Array, Array]:
-    """(d, c) of the next step from the gates' pre-activations i, f, g, o, each (*lead, d):
+class LSTMSlopes(NamedTuple):
+    """Derivatives of one step of an LSTM, entry by entry."""
+
+    gates: Float[Array, "*batch gates"]  # of c' by the pre-activations i, f, g, and of d' by o
+    d: Float[Array, "*batch d"]  # of d' by c'
+    c: Float[Array, "*batch d"]  # of c' by c
+
+
+def lstm_step(gates: Float[Array, "*batch gates"], c: Float[Array, "*batch d"]) -> tuple[LSTMState, LSTMSlopes]:
+    """The next state from the gates' pre-activations i, f, g, o side by side, and its derivatives:
 
     c' = σ(f) c + σ(i) tanh g,   d' = σ(o) tanh c'
 
     One tanh serves all four, as σ(x) = ½ tanh(x/2) + ½: XLA vectorises it over the whole array, which it does not
-    do for four functions of slices (5 times slower); the gradient is written by hand for the same reason.
+    do for four functions of slices (5 times slower).
     """
-    return _lstm_forward(gates, c)[0]
-
-
-def _lstm_forward(gates, c):
-    half = 0.5 * gates
     size = c.shape[-1]
     is_g = (jnp.arange(4 * size) // size == 2).reshape((1,) * (gates.ndim - 1) + (-1,))
-    squashed = jnp.tanh(jnp.where(is_g, gates, half))
+    squashed = jnp.tanh(jnp.where(is_g, gates, 0.5 * gates))
     i, f, g, o = jnp.split(squashed, 4, axis=-1)
     i, f, o = (0.5 * gate + 0.5 for gate in (i, f, o))
     c_next = f * c + i * g
     tanh_c = jnp.tanh(c_next)
-    return (o * tanh_c, c_next), (i, f, g, o, c, tanh_c)
+    slopes = (g * i * (1 - i), c * f * (1 - f), i * (1 - g**2), tanh_c * o * (1 - o))
+    return LSTMState(o * tanh_c, c_next), LSTMSlopes(jnp.concatenate(slopes, axis=-1), o * (1 - tanh_c**2), f)
 
 
-def _lstm_backward(saved, cotangents):
-    i, f, g, o, c, tanh_c = saved
-    grad_d, grad_c = cotangents
-    grad_c = grad_c + grad_d * o * (1 - tanh_c**2)
-    grad_gates = (
-        grad_c * g * i * (1 - i),
-        grad_c * c * f * (1 - f),
-        grad_c * i * (1 - g**2),
-        grad_d * tanh_c * o * (1 - o),
-    )
-    return jnp.concatenate(grad_gates, axis=-1), grad_c * f
-
-
-lstm_state.defvjp(_lstm_forward, _lstm_backward)
+def lstm_step_backward(
+    slopes: LSTMSlopes, grad: LSTMState
+) -> tuple[Float[Array, "*batch gates"], Float[Array, "*batch d"]]:
+    """The gradients of the gates and of c, given that of the next state."""
+    grad_c = grad.c + grad.d * slopes.d
+    return jnp.concatenate([grad_c, grad_c, grad_c, grad.d], axis=-1) * slopes.gates, grad_c * slopes.c
 
 
 class LSTM(eqx.Module):
@@ -141,39 +138,27 @@ class LSTM(eqx.Module):
     ) -> LSTMState:
         """The states at every step, from `start` and from zero wherever is_first; leaves (time, batch, d)."""
         given = x @ self.w_x
-        return _lstm_loop(self.w_d, start, given + jnp.broadcast_to(self.bias, given.shape), is_first)[1]
+        given = given + jnp.broadcast_to(self.bias, given.shape)
+        return unroll(LSTM_CELL, self.w_d, start, given, is_first, None)
 
 
-def _lstm_scan(w_d, start, given, is_first):
-    """d_{t-1} and the state after it, at every step."""
-
-    def step(state, inputs):
-        given, is_first = inputs
-        before = jax.tree.map(lambda leaf: jnp.where(is_first[:, None], 0.0, leaf), state)
-        state = LSTMState(*lstm_state(given + before.d @ w_d, before.c))
-        return state, (before.d, state)
-
-    return jax.lax.scan(step, start, (given, is_first))[1]
+def _lstm_forward(w_d, before, given, noise):
+    state, slopes = lstm_step(given + before.d @ w_d, before.c)
+    return state, state, (before.d, slopes)
 
 
-@jax.custom_vjp
-def _lstm_loop(w_d, start, given, is_first):
-    return _lstm_scan(w_d, start, given, is_first)
+def _lstm_backward(w_d, memory, grad_state, grad_output):
+    _, slopes = memory.saved
+    grad_gates, grad_c = lstm_step_backward(slopes, jax.tree.map(jnp.add, grad_state, grad_output))
+    return LSTMState(grad_gates @ w_d, grad_c), grad_gates
 
 
-def _lstm_loop_forward(w_d, start, given, is_first):
-    result, pullback = jax.vjp(lambda start, given: _lstm_scan(w_d, start, given, is_first), start, given)
-    return result, (result[0], pullback)
+def _lstm_factors(memory, grad_gates):
+    d_before, _ = memory.saved
+    return grad_gates, d_before, grad_gates
 
 
-def _lstm_loop_backward(saved, cotangent):
-    """The gradient of w_d is one product after the loop; plain differentiation would add one up at every step."""
-    before, pullback = saved
-    grad_start, grad_given = pullback(cotangent)
-    return jnp.einsum("tbm,tbn->mn", before, grad_given), grad_start, grad_given, None
-
-
-_lstm_loop.defvjp(_lstm_loop_forward, _lstm_loop_backward)
+LSTM_CELL = Cell(_lstm_forward, _lstm_backward, _lstm_factors)
 
 
 class Gaussian(NamedTuple):

@@ -19,16 +19,16 @@ from beliefrl.types import Timestep
 
 
 class Returns(NamedTuple):
-    """What the transitions that begin at each moment of windows (time-major) lead to."""
+    """What the transitions that begin at each timestep of windows (time-major) lead to."""
 
-    end: Int[Array, "length batch"]  # index of s_{t+m} among the windows' moments
+    end: Int[Array, "length batch"]  # index of s_{t+m} among the windows' timesteps
     reward: Float[Array, "length batch"]  # discounted sum of the m rewards
     terminated: Bool[Array, "length batch"]  # s_{t+m} is terminal
     discount: Float[Array, "length batch"]  # γ^m
 
 
 def n_step_returns(step: Timestep, valid: Bool[Array, "length batch"], n: int, gamma: float) -> Returns:
-    """The returns of `length` transitions, given the length + 1 moments between which they lie.
+    """The returns of `length` transitions, given the length + 1 timesteps between which they lie.
 
     `valid` says which neighbours are transitions; of those that are not, what is returned means nothing.
     """
@@ -60,9 +60,9 @@ def transition_batch(
     gamma: float,
     actor_input: Float[Array, "time batch actor_input"] | None = None,
 ) -> Batch:
-    """The transitions between length + 1 moments of windows (time-major), leaves (length, batch, ...).
+    """The transitions between length + 1 timesteps of windows (time-major), leaves (length, batch, ...).
 
-    `next_belief` holds the inputs of V̄ at the same moments; `actor_input` the actor's where not `belief`.
+    `next_belief` holds the inputs of V̄ at the same timesteps; `actor_input` the actor's where not `belief`.
     """
     returns = n_step_returns(step, valid, n, gamma)
     after = next_belief[1:] if n == 1 else jnp.take_along_axis(next_belief, returns.end[..., None], axis=0)

@@ -10,8 +10,7 @@ Source: Section 4.1, Appendix A.1. With x_t = (o_t, r_{t-1}), a_{t-1} the action
 
 Speed decides the form. The posterior's first layers and the LSTM's gates are one layer, `Joint`, kept apart by what it
 multiplies: its products with f_x(x) and a are one batched product before the loop, prior and decoder run after it,
-and the loop keeps the products with d and z. The gradient of a weight inside the loop is one product after it
-(`_loop_backward`); plain differentiation would add up whole matrices at every step.
+and the loop keeps the products with d and z. The loop and its gradient are those of `recurrence`.
 
 Departure: one bias for each gate, where PyTorch's LSTM adds up two.
 """
@@ -23,7 +22,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from beliefrl.models.nets import MLP, Gaussian, Linear, LSTMState, gaussian_kl, gaussian_log_prob, lstm_state
+from beliefrl.models.nets import (
+    MLP,
+    Gaussian,
+    Linear,
+    LSTMState,
+    gaussian_kl,
+    gaussian_log_prob,
+    lstm_step,
+    lstm_step_backward,
+)
+from beliefrl.models.recurrence import Cell, unroll
 
 SIGMA_X_MIN = 1e-3
 
@@ -129,14 +138,15 @@ class VRM(eqx.Module):
         """Unroll the inference model with z_t = μ_q + σ_q · noise_t, from `start` and from zero wherever is_first."""
         given = self.joint.given(jax.vmap(jax.vmap(self.features))(x), prev_action, not self.deterministic)
         noise = jnp.zeros_like(noise) if self.deterministic else noise
-        weights = VRMLoopWeights(self.joint.w_d, self.joint.w_z, self.posterior_mean, self.posterior_sigma)
-        return _loop(weights, start, given, is_first, noise)
+        mean, sigma = self.posterior_mean, self.posterior_sigma
+        weights = LoopWeights(self.joint.w_d, self.joint.w_z, mean.weight.T, sigma.weight.T, mean.bias, sigma.bias)
+        return unroll(CELL, weights, start, given, is_first, noise)
 
     def next_state(self, state: LSTMState, x: Float[Array, " x"], z: Float[Array, " z"]) -> LSTMState:
         """d_t and its cell, from d_{t-1} and its cell."""
         joint, gates = self.joint, slice(-self.joint.w_z.shape[1], None)
         given = self.features(x) @ joint.w_features[:, gates] + state.d @ joint.w_d[:, gates] + joint.bias[gates]
-        return LSTMState(*lstm_state(given + z @ joint.w_z, state.c))
+        return lstm_step(given + z @ joint.w_z, state.c)[0]
 
 
 def predict(
@@ -146,7 +156,7 @@ def predict(
     observed: Bool[Array, " time"],
     noise: tuple[Float[Array, "time z"], Float[Array, "time x"]],
 ) -> Gaussian:
-    """p(x_t | z_t, d_{t-1}) along one episode from its first moment on, leaves (time, x).
+    """p(x_t | z_t, d_{t-1}) along one episode from its first timestep on, leaves (time, x).
 
     Where x_t is `observed`, z_t is drawn from the posterior: open loop. Elsewhere z_t is drawn from the prior, and the
     LSTM reads a draw of x_t from the decoder: closed loop. A deterministic model has σ = 0.
@@ -154,8 +164,8 @@ def predict(
 
     def step(state: LSTMState, inputs: tuple) -> tuple[LSTMState, Gaussian]:
         x, prev_action, observed, (noise_z, noise_x) = inputs
-        moment = jax.tree.map(lambda leaf: leaf[None, None], (x, prev_action, jnp.array(False), noise_z))
-        z = vrm.infer(jax.tree.map(lambda leaf: leaf[None], state), *moment).z[0, 0]
+        timestep = jax.tree.map(lambda leaf: leaf[None, None], (x, prev_action, jnp.array(False), noise_z))
+        z = vrm.infer(jax.tree.map(lambda leaf: leaf[None], state), *timestep).z[0, 0]
         if not vrm.deterministic:  # there posterior and prior are one
             prior = vrm.prior(state.d, prev_action)
             z = jnp.where(observed, z, prior.mean + prior.sigma * noise_z)
@@ -201,75 +211,52 @@ def prediction_error(vrm: VRM, inferred: Inferred, x: Float[Array, "time batch x
     return jnp.mean((predicted - x) ** 2, axis=-1)
 
 
-class VRMLoopWeights(NamedTuple):
-    """The weights that stay inside the loop."""
+class LoopWeights(NamedTuple):
+    """The weights that stay inside the loop: (input, output), and the biases of the posterior's last layers."""
 
     w_d: Float[Array, "d joint"]
     w_z: Float[Array, "z 4*d"]
-    mean: Linear
-    sigma: Linear
+    mean: Float[Array, "hidden z"]
+    sigma: Float[Array, "hidden z"]
+    mean_bias: Float[Array, " z"]
+    sigma_bias: Float[Array, " z"]
 
 
-class Hidden(NamedTuple):
-    """What the gradient of the loop's weights needs besides what `Inferred` holds, leaves (time, batch, ...)."""
-
-    mean: Float[Array, "time batch hidden"]
-    sigma: Float[Array, "time batch hidden"]
-
-
-def _cell(weights, state, given, zero, is_first, noise):
-    """One step. `zero` is added to the outputs of the posterior's last layers: its cotangent is theirs."""
-    before = jax.tree.map(lambda leaf: jnp.where(is_first[:, None], 0.0, leaf), state)
-    pre = given + before.d @ weights.w_d
-    hidden = weights.mean.weight.shape[1]
-    first = jnp.tanh(pre[:, : 2 * hidden])
-    hidden_mean, hidden_sigma = first[:, :hidden], first[:, hidden:]
-    mean = jax.vmap(weights.mean)(hidden_mean) + zero.mean
-    sigma = jax.nn.softplus(jax.vmap(weights.sigma)(hidden_sigma) + zero.sigma)
+def _forward(weights, before, given, noise):
+    """One step: prepares the posterior's hidden layers and the gates, draws z, and moves the LSTM."""
+    hidden = weights.mean.shape[0]
+    joint = given + before.d @ weights.w_d
+    first = jnp.tanh(joint[:, : 2 * hidden])
+    bias_mean, bias_sigma = (jnp.broadcast_to(b, noise.shape) for b in (weights.mean_bias, weights.sigma_bias))
+    mean = first[:, :hidden] @ weights.mean + bias_mean
+    sigma = jax.nn.softplus(first[:, hidden:] @ weights.sigma + bias_sigma)
     z = mean + sigma * noise
-    state = LSTMState(*lstm_state(pre[:, 2 * hidden :] + z @ weights.w_z, before.c))
-    return state, (Inferred(Gaussian(mean, sigma), z, before.d, state), Hidden(hidden_mean, hidden_sigma))
+    state, slopes = lstm_step(joint[:, 2 * hidden :] + z @ weights.w_z, before.c)
+    return state, Inferred(Gaussian(mean, sigma), z, before.d, state), (first, slopes)
 
 
-def _scan(weights, start, given, zero, is_first, noise):
-    def step(state, inputs):
-        return _cell(weights, state, *inputs)
-
-    return jax.lax.scan(step, start, (given, zero, is_first, noise))[1]
-
-
-@jax.custom_vjp
-def _loop(weights, start, given, is_first, noise) -> Inferred:
-    return _scan(weights, start, given, Gaussian(jnp.zeros_like(noise), jnp.zeros_like(noise)), is_first, noise)[0]
-
-
-def _loop_forward(weights, start, given, is_first, noise):
-    zero = Gaussian(jnp.zeros_like(noise), jnp.zeros_like(noise))
-    (inferred, hidden), pullback = jax.vjp(
-        lambda start, given, zero: _scan(weights, start, given, zero, is_first, noise), start, given, zero
-    )
-    return inferred, (weights, inferred, hidden, pullback)
+def _backward(weights, memory, grad_state, grad_output):
+    """The gradient of one step; the weights are transposed."""
+    first, slopes = memory.saved
+    grad_gates, grad_c = lstm_step_backward(slopes, jax.tree.map(jnp.add, grad_state, grad_output.state))
+    grad_z = grad_output.z + grad_gates @ weights.w_z
+    grad_mean = grad_output.posterior.mean + grad_z
+    softplus_slope = -jnp.expm1(-memory.output.posterior.sigma)  # a sigmoid, of σ = softplus(x)
+    grad_sigma = (grad_output.posterior.sigma + grad_z * memory.noise) * softplus_slope
+    grad_hidden = jnp.concatenate([grad_mean @ weights.mean, grad_sigma @ weights.sigma], axis=-1)
+    grad_joint = jnp.concatenate([grad_hidden * (1 - first**2), grad_gates], axis=-1)
+    grad_d = grad_output.before + grad_joint @ weights.w_d
+    return LSTMState(grad_d, grad_c), (grad_joint, grad_mean, grad_sigma)
 
 
-def _loop_backward(saved, cotangent):
-    weights, inferred, hidden, pullback = saved
-    grad_start, grad_given, grad_last = pullback((cotangent, jax.tree.map(jnp.zeros_like, hidden)))
-
-    def product(left, right):
-        return jnp.einsum("tbm,tbn->mn", left, right)
-
-    def layer(linear, inputs, outputs):
-        gradient = (product(outputs, inputs), jnp.sum(outputs, (0, 1)))
-        return eqx.tree_at(lambda layer: (layer.weight, layer.bias), linear, gradient)
-
-    grad_gates = grad_given[..., -weights.w_z.shape[1] :]
-    grad_weights = VRMLoopWeights(
-        product(inferred.before, grad_given),
-        product(inferred.z, grad_gates),
-        layer(weights.mean, hidden.mean, grad_last.mean),
-        layer(weights.sigma, hidden.sigma, grad_last.sigma),
-    )
-    return grad_weights, grad_start, grad_given, None, None
+def _factors(memory, grads):
+    """The gradient of what was given; what each weight in the loop multiplied; the gradient of the product."""
+    grad_joint, grad_mean, grad_sigma = grads
+    hidden_mean, hidden_sigma = jnp.split(memory.saved[0], 2, axis=-1)
+    before, z = memory.output.before, memory.output.z
+    inputs = LoopWeights(before, z, hidden_mean, hidden_sigma, hidden_mean, hidden_sigma)
+    grad_gates = grad_joint[..., 2 * hidden_mean.shape[-1] :]
+    return grad_joint, inputs, LoopWeights(grad_joint, grad_gates, grad_mean, grad_sigma, grad_mean, grad_sigma)
 
 
-_loop.defvjp(_loop_forward, _loop_backward)
+CELL = Cell(_forward, _backward, _factors)
