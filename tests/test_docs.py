@@ -12,9 +12,8 @@ import runpy
 import pytest
 
 import beliefrl
-from beliefrl import agents, tasks
+from beliefrl import agents, catalogue, tasks
 from beliefrl.cli import COMMANDS, main
-from beliefrl.tasks import registered
 from beliefrl.types import UserError
 
 ROOT = pathlib.Path(__file__).parent.parent
@@ -86,19 +85,19 @@ def entries(cell):
 def test_the_page_of_tasks_has_every_task_as_it_is():
     table = rows((DOCS / "tasks.md").read_text())
     table = {name: row for name, row in table.items() if not any(name in constants(task) for task in tasks.TASKS)}
-    assert set(table) == {*tasks.names(), *registered.names()} - {registered.ANY}
+    assert set(table) == {*tasks.names(), *catalogue.environment_names()} - {catalogue.ANY}
     for name in tasks.names():
         _, numbers, actions, steps, indices = table[name]
         base = re.sub("-[vp]$", "", name)
-        velocities, positions = tasks.masks(tasks.TASKS.get(base) or registered.ROBOTS[base])
+        velocities, positions = tasks.masks(tasks.TASKS.get(base) or catalogue.ROBOTS[base])
         seen = {"-v": velocities, "-p": positions}.get(name[-2:]) or tuple(sorted(velocities + positions))
         if seen:
             assert entries(indices) == seen, name
         assert len(entries(indices)) == int(numbers), name
         if base in tasks.TASKS:
             assert tasks.make(name).spec[:3] == (int(numbers), int(actions), int(steps)), name
-    for known in registered.GYMNASIUMS:
-        _, velocities, numbers = table[registered.PREFIX + known.id]
+    for known in catalogue.GYMNASIUMS:
+        _, velocities, numbers = table[catalogue.PREFIX + known.id]
         assert entries(velocities) == known.velocities
         assert int(numbers) == len(known.velocities + known.positions)
 

@@ -8,32 +8,35 @@ run = beliefrl.train(agent, task, steps=15_000, seeds=3, out="runs/first")
 print(beliefrl.evaluate(run, episodes=20))
 """
 
-from importlib.metadata import version
+import importlib
+from typing import TYPE_CHECKING, Any
 
-from beliefrl.agents import Agent
-from beliefrl.agents import make as make_agent
-from beliefrl.analysis.curves import draw_curve
-from beliefrl.policy import Policy, load
-from beliefrl.report import write_report
-from beliefrl.runs.options import Options
-from beliefrl.runs.run import Run
-from beliefrl.sweeps.plan import Experiment, grid
-from beliefrl.sweeps.run import SweepStatus, sweep
-from beliefrl.tasks import Task, observe
-from beliefrl.tasks import make as make_task
-from beliefrl.tasks.environment import TaskEnvironment, register
-from beliefrl.tasks.gymnasium import GymnasiumTask
-from beliefrl.training.evaluation import evaluate, task_of
-from beliefrl.training.schedule import Event
-from beliefrl.training.stop import Stopped
-from beliefrl.training.train import resume, train
-from beliefrl.types import Spec, StoredTimestep, Timestep, UserError, Window, WindowShape
-from beliefrl.viewing.episodes import Trajectory, play
-from beliefrl.viewing.films import film, video
-from beliefrl.viewing.prediction import Predictions, draw_predictions, predictions
+from beliefrl.registration import register_when_imported
 
-__version__ = version("beliefrl")
-register()  # gymnasium.make("BeliefRL/PendulumV-v0")
+if TYPE_CHECKING:
+    from beliefrl.agents import Agent
+    from beliefrl.agents import make as make_agent
+    from beliefrl.analysis.curves import draw_curve
+    from beliefrl.policy import Policy, load
+    from beliefrl.report import write_report
+    from beliefrl.runs.options import Options
+    from beliefrl.runs.run import Run
+    from beliefrl.sweeps.plan import Experiment, grid
+    from beliefrl.sweeps.run import SweepStatus, sweep
+    from beliefrl.tasks import Task, observe
+    from beliefrl.tasks import make as make_task
+    from beliefrl.tasks.environment import TaskEnvironment
+    from beliefrl.tasks.gymnasium import GymnasiumTask
+    from beliefrl.training.evaluation import evaluate, task_of
+    from beliefrl.training.schedule import Event
+    from beliefrl.training.stop import Stopped
+    from beliefrl.training.train import resume, train
+    from beliefrl.types import Spec, StoredTimestep, Timestep, UserError, Window, WindowShape
+    from beliefrl.viewing.episodes import Trajectory, play
+    from beliefrl.viewing.films import film, video
+    from beliefrl.viewing.prediction import Predictions, draw_predictions, predictions
+
+register_when_imported()  # gymnasium.make("BeliefRL/PendulumV-v0")
 
 __all__ = [
     "Agent",
@@ -73,3 +76,72 @@ __all__ = [
     "video",
     "write_report",
 ]
+
+# Each name is imported when it is first used, so `import beliefrl` and the command line's lists do not wait for JAX.
+_HOMES = {
+    "Agent": "agents:Agent",
+    "Event": "training.schedule:Event",
+    "Experiment": "sweeps.plan:Experiment",
+    "GymnasiumTask": "tasks.gymnasium:GymnasiumTask",
+    "Options": "runs.options:Options",
+    "Policy": "policy:Policy",
+    "Predictions": "viewing.prediction:Predictions",
+    "Run": "runs.run:Run",
+    "Spec": "types:Spec",
+    "Stopped": "training.stop:Stopped",
+    "StoredTimestep": "types:StoredTimestep",
+    "SweepStatus": "sweeps.run:SweepStatus",
+    "Task": "tasks:Task",
+    "TaskEnvironment": "tasks.environment:TaskEnvironment",
+    "Timestep": "types:Timestep",
+    "Trajectory": "viewing.episodes:Trajectory",
+    "UserError": "types:UserError",
+    "Window": "types:Window",
+    "WindowShape": "types:WindowShape",
+    "draw_curve": "analysis.curves:draw_curve",
+    "draw_predictions": "viewing.prediction:draw_predictions",
+    "evaluate": "training.evaluation:evaluate",
+    "film": "viewing.films:film",
+    "grid": "sweeps.plan:grid",
+    "load": "policy:load",
+    "make_agent": "agents:make",
+    "make_task": "tasks:make",
+    "observe": "tasks:observe",
+    "play": "viewing.episodes:play",
+    "predictions": "viewing.prediction:predictions",
+    "resume": "training.train:resume",
+    "sweep": "sweeps.run:sweep",
+    "task_of": "training.evaluation:task_of",
+    "train": "training.train:train",
+    "video": "viewing.films:video",
+    "write_report": "report:write_report",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """A name of `__all__`, or a module of the package."""
+    module, _, attribute = _HOMES.get(name, name).partition(":")
+    if name == "__version__":
+        from importlib.metadata import version
+
+        value = version("beliefrl")
+    elif attribute:
+        value = getattr(importlib.import_module(f"beliefrl.{module}"), attribute)
+    else:
+        value = _module(name)
+    globals()[name] = value
+    return value
+
+
+def _module(name: str) -> Any:
+    qualified = f"{__name__}.{name}"
+    try:
+        return importlib.import_module(qualified)
+    except ModuleNotFoundError as error:
+        if error.name != qualified:
+            raise
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}") from None
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__, "__version__"})

@@ -1,12 +1,11 @@
 """The command line: finds the command, shows help, and turns errors into exit codes."""
 
-import difflib
 import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
-from beliefrl.commands import COMMANDS
-from beliefrl.commands.arguments import UsageError
+from beliefrl.commands import COMMANDS, find
+from beliefrl.errors import UsageError, UserError, one_line
 
 HELP = """usage: beliefrl COMMAND ...
 
@@ -62,16 +61,16 @@ def main(argv: Sequence[str] | None = None) -> None:
         print(version("beliefrl"))
         return
     if argv[0] not in COMMANDS:
+        import difflib
+
         near = difflib.get_close_matches(argv[0], COMMANDS, n=1)
         hint = f"did you mean {near[0]}?" if near else f"there is {', '.join(COMMANDS)}."
         _fail(f"There is no command {argv[0]!r}: {hint}")
 
-    from beliefrl.types import UserError, one_line
-
     if "" not in sys.path:
         sys.path.insert(0, "")  # as `python -m` does: finds my_module:MyAgent and gym:my_module:MyEnv-v0 here
     try:
-        COMMANDS[argv[0]](argv[1:])
+        find(argv[0])(argv[1:])
     except (UsageError, UserError) as error:
         _fail(one_line(str(error)))
     except KeyboardInterrupt as stopped:

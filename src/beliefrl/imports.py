@@ -10,7 +10,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from beliefrl.types import UserError, one_line, said
+from beliefrl.errors import UserError, one_line, said
 
 NAME = re.compile(r"\w[\w.-]*")  # of an entry point; a module:Class is none
 

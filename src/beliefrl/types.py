@@ -6,7 +6,6 @@ Axis names in shapes, everywhere: `seed` (one training each), `batch` (windows),
 
 import dataclasses
 import numbers
-import re
 import typing
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -15,30 +14,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from beliefrl.errors import UserError as UserError
+from beliefrl.errors import one_line as one_line
+from beliefrl.errors import said as said
+from beliefrl.errors import short as short
 
-class UserError(Exception):
-    """A mistake that the user can mend. Its message is one sentence: what was wrong, and what to do."""
-
-
-def said(error: BaseException) -> str:
-    """An exception of somebody else's code, to be put in a sentence: on one line, without control characters."""
-    text = one_line(str(error))[:300].rstrip(".")
-    return f"{type(error).__name__}: {text}" if text else type(error).__name__
-
-
-def one_line(text: str) -> str:
-    """Text from elsewhere on one line, without terminal escapes and other control characters."""
-    text = " ".join(ESCAPES.sub("", text).split())
-    return "".join(character for character in text if character.isprintable())
-
-
-def short(value: Any) -> str:
-    """How a value is written, on one line of at most 80 characters."""
-    text = one_line(repr(value))
-    return text if len(text) <= 80 else f"{text[:77]}..."
-
-
-ESCAPES = re.compile(r"(?:\x1b\[|\x9b)[0-?]*[ -/]*[@-~]|\x1b\].*?(?:\x07|\x1b\\)", re.DOTALL)  # colours, titles, links
 LARGEST = 2**31 - 1  # integer in a compiled program
 WIDEST = 100_000  # layer or state of a network
 

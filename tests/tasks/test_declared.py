@@ -5,12 +5,13 @@ import dataclasses
 import pytest
 
 from beliefrl import tasks
+from beliefrl.tasks.pendulum import Pendulum
 from beliefrl.types import UserError
 from worlds import Counting, installed
 
 
 @dataclasses.dataclass(frozen=True)
-class Masked(tasks.Pendulum):
+class Masked(Pendulum):
     VELOCITIES = [2]
     POSITIONS = [0, 1]
 
@@ -42,7 +43,7 @@ def test_a_task_that_says_so_has_versions_with_a_part_of_the_observation(package
 
 
 def test_ours_are_not_hidden(package):
-    assert isinstance(tasks.make("pendulum"), tasks.Pendulum)
+    assert isinstance(tasks.make("pendulum"), Pendulum)
     assert "worlds" not in tasks.names()["pendulum"]
 
 

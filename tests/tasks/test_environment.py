@@ -12,7 +12,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from beliefrl import tasks
-from beliefrl.tasks.environment import TaskEnvironment, ids, register
+from beliefrl.registration import ids, register
+from beliefrl.tasks.environment import TaskEnvironment
 from beliefrl.types import UserError
 from worlds import Counting
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from beliefrl import tasks
+from beliefrl import catalogue, tasks
 from beliefrl.tasks import gymnasium as adapter
 from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
 from beliefrl.training.lockstep import Lockstep
@@ -152,10 +152,10 @@ def test_masks_by_name_are_those_of_the_task():
     assert tasks.make("gym:MountainCarContinuous-v0", observe="velocities").indices == (1,)
     assert tasks.make("gym:Pendulum-v1", observe=["positions"]).indices == (0, 1)
     assert tasks.describe(tasks.make("pendulum", observe="velocities"))["task"] == "pendulum-v"
-    hopper = tasks.registered.ROBOTS["hopper"]
+    hopper = catalogue.ROBOTS["hopper"]
     assert hopper.velocities == (3, 4, 5, 9, 11, 13)  # the authors' index sets
     assert hopper.positions == (0, 1, 2, 6, 7, 8, 10, 12, 14)
-    ant = tasks.registered.ROBOTS["ant"]
+    ant = catalogue.ROBOTS["ant"]
     assert ant.velocities == (3, 4, 5, 9, 11, 13, 15, 17, 19, 21, 23)
     assert ant.positions == (0, 1, 2, 6, 7, 8, 10, 12, 14, 16, 18, 20, 22, 24, 25, 26, 27)
 
@@ -218,17 +218,17 @@ def test_without_the_extra_there_is_the_command_to_install_it(name, extra, monke
         _ = tasks.make(name).spec
 
 
-@pytest.mark.parametrize("known", tasks.registered.ROBOTS, ids=str)
+@pytest.mark.parametrize("known", catalogue.ROBOTS, ids=str)
 def test_robots_have_the_observations_of_their_masks(known):
     pytest.importorskip("pybullet_envs_gymnasium")
-    robot = tasks.registered.ROBOTS[known]
+    robot = catalogue.ROBOTS[known]
     size = len(robot.velocities) + len(robot.positions)
     assert tasks.make(known).spec.obs_dim == size
     assert tasks.make(f"{known}-v").spec.obs_dim == len(robot.velocities)
     assert tasks.make(f"{known}-p").environment().reset(seed=0)[0].shape == (len(robot.positions),)
 
 
-@pytest.mark.parametrize("known", [each for each in tasks.registered.GYMNASIUMS if each.extra], ids=lambda k: k.id)
+@pytest.mark.parametrize("known", [each for each in catalogue.GYMNASIUMS if each.extra], ids=lambda k: k.id)
 def test_velocities_of_mujoco_are_the_simulators(known):
     pytest.importorskip("mujoco")
     pytest.importorskip("imageio")

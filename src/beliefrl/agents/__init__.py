@@ -1,18 +1,16 @@
-"""Agents: what learns. A new agent is one file and one line in `AGENTS`, or a class of a user's (`find_class`)."""
+"""Agents: what learns. A new agent is one file and one line in `catalogue.AGENTS`, or a user's class (`find_class`)."""
 
 import dataclasses
-import difflib
 import functools
 import json
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Array, Bool, Float, Key
 
+from beliefrl import catalogue
 from beliefrl.agents.hyperparameters import build
-from beliefrl.agents.sac_lstm import SACLSTMAgent
-from beliefrl.agents.sac_mlp import SACMLPAgent
-from beliefrl.agents.slac import SLACAgent
-from beliefrl.agents.vrm import VRMAgent
+from beliefrl.catalogue import AGENT_GROUP as GROUP
+from beliefrl.catalogue import agent_names as names  # noqa: F401 - agents.names
 from beliefrl.imports import declared, declared_name, is_named, load, load_declared, path
 from beliefrl.models.nets import Gaussian
 from beliefrl.types import Spec, Timestep, UserError, Window, WindowShape
@@ -120,42 +118,14 @@ class Predictive(Protocol):
         ...
 
 
-class Entry(NamedTuple):
-    agent: Any  # with the hyperparameters that the name stands for
-    about: str
-
-
-def _own(agent: type) -> Entry:
-    """An agent under its own name: as it is, and described by its docstring."""
-    return Entry(agent(), (agent.__doc__ or "").split("\n")[0])
-
-
-GROUP = "beliefrl.agents"  # of entry points
-AGENTS: dict[str, Entry] = {
-    "vrm": _own(VRMAgent),
-    "sac-mlp": _own(SACMLPAgent),
-    "sac-lstm": _own(SACLSTMAgent),
-    "slac": _own(SLACAgent),
-    "vrm-single": Entry(VRMAgent(models="single"), "Ablation: one model that is pre-trained and keeps learning."),
-    "vrm-first": Entry(VRMAgent(models="first"), "Ablation: only the first-impression model."),
-    "vrm-keep": Entry(VRMAgent(models="keep"), "Ablation: only the keep-learning model."),
-    "vrm-deterministic": Entry(
-        VRMAgent(deterministic=True), "Ablation: models without noise, trained on squared error."
-    ),
-}
-
-
-def names() -> dict[str, str]:
-    """Every agent's name with a sentence on it: ours, then those of installed packages, which are not imported."""
-    return {name: entry.about for name, entry in AGENTS.items()} | {
-        name: f"{value}, of an installed package." for name, value in declared(GROUP, AGENTS).items()
-    }
+# Every name of ours, and the agent with the hyperparameters that the name stands for.
+AGENTS: dict[str, Any] = {name: load(known.path)(**known.hyperparameters) for name, known in catalogue.AGENTS.items()}
 
 
 @functools.cache
 def defaults() -> dict[str, dict[str, Any]]:
     """The hyperparameters of each of our agents as its name stands for them, as JSON has them."""
-    return {name: json.loads(json.dumps(dataclasses.asdict(entry.agent))) for name, entry in AGENTS.items()}
+    return {name: json.loads(json.dumps(dataclasses.asdict(agent))) for name, agent in AGENTS.items()}
 
 
 def find_class(name: str) -> type:
@@ -165,16 +135,11 @@ def find_class(name: str) -> type:
         UserError: no agent has that name, or the class is no agent.
     """
     if name in AGENTS:
-        return type(AGENTS[name].agent)
+        return type(AGENTS[name])
     if is_own(name):
         return check_class(load(name))
-    theirs = declared(GROUP, AGENTS)
-    if name in theirs:
-        return check_class(load_declared(GROUP, name, theirs[name]))
-    near = difflib.get_close_matches(name, [*AGENTS, *theirs], n=1)
-    there = ", ".join([*AGENTS, *theirs])
-    hint = f"did you mean {near[0]}?" if near else f"there is {there}, and MODULE:CLASS for one of your own."
-    raise UserError(f"There is no agent {name!r}: {hint}")
+    catalogue.check_agent(name)
+    return check_class(load_declared(GROUP, name, declared(GROUP, AGENTS)[name]))
 
 
 def check_class(kind: type) -> type:
@@ -221,7 +186,7 @@ def named(name: str) -> Any:
     Raises:
         UserError: as `find_class`.
     """
-    return AGENTS[name].agent if name in AGENTS else find_class(name)
+    return AGENTS[name] if name in AGENTS else find_class(name)
 
 
 def name_of(agent: Agent) -> str:
@@ -230,7 +195,7 @@ def name_of(agent: Agent) -> str:
     Of names that share a class (the ablations) it is the one whose own settings the agent has.
     """
     found = None
-    for name, (known, _) in AGENTS.items():
+    for name, known in AGENTS.items():
         if type(agent) is type(known):
             own = [field.name for field in dataclasses.fields(known) if getattr(known, field.name) != field.default]
             if all(getattr(agent, field) == getattr(known, field) for field in own):
@@ -246,5 +211,5 @@ def is_own(name: str) -> bool:
 def is_of(kind: type, name: str) -> bool:
     """Whether agents of that name are of this class; imports nothing."""
     if name in AGENTS:
-        return type(AGENTS[name].agent) is kind
+        return type(AGENTS[name]) is kind
     return is_named(kind, name) or declared_name(GROUP, kind, AGENTS) == name

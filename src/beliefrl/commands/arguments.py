@@ -12,11 +12,7 @@ from typing import Annotated, Any
 import tyro
 
 from beliefrl.commands.values import VALUES
-
-
-class UsageError(Exception):
-    """A mistake on the command line; the message is one sentence."""
-
+from beliefrl.errors import UsageError as UsageError
 
 OwnAgent = Annotated[
     str | None,

@@ -1,9 +1,9 @@
-"""Lists of names: `beliefrl tasks` and `beliefrl agents`."""
+"""Lists of names: `beliefrl tasks` and `beliefrl agents`. They import neither JAX nor, without options, tyro."""
 
 import dataclasses
 from collections.abc import Sequence
 
-from beliefrl.commands.arguments import parse
+from beliefrl import catalogue
 
 
 @dataclasses.dataclass(frozen=True)
@@ -13,18 +13,21 @@ class ListOptions:
 
 def list_tasks(argv: Sequence[str]) -> None:
     """`beliefrl tasks`."""
-    parse(ListOptions, argv, "beliefrl tasks")
-    from beliefrl import tasks
-
-    _print_names(tasks.names() | tasks.registered.names())
+    _check(argv, "beliefrl tasks")
+    _print_names(catalogue.task_names() | catalogue.environment_names())
 
 
 def list_agents(argv: Sequence[str]) -> None:
     """`beliefrl agents`."""
-    parse(ListOptions, argv, "beliefrl agents")
-    from beliefrl import agents
+    _check(argv, "beliefrl agents")
+    _print_names(catalogue.agent_names())
 
-    _print_names(agents.names())
+
+def _check(argv: Sequence[str], prog: str) -> None:
+    if argv:
+        from beliefrl.commands.arguments import parse
+
+        parse(ListOptions, argv, prog)
 
 
 def _print_names(names: dict[str, str]) -> None:

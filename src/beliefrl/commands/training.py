@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from beliefrl import catalogue
 from beliefrl.commands.arguments import OwnAgent, agent_name, agent_options, named_values, own_agent, parse
 
 
@@ -25,6 +26,8 @@ class ResumeOptions:
 
 def train(argv: Sequence[str]) -> None:
     """`beliefrl train AGENT TASK ...`."""
+    name, rest = agent_name(argv, "train", "TASK")
+    catalogue.check_agent(name)  # before JAX is imported
     from rich.console import Console
 
     from beliefrl import agents, tasks
@@ -33,7 +36,6 @@ def train(argv: Sequence[str]) -> None:
     from beliefrl.runs.run import Run
     from beliefrl.training.train import train as run_training
 
-    name, rest = agent_name(argv, "train", "TASK")
     options_type = agent_options(
         agents.find(name),
         {

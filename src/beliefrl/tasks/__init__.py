@@ -1,4 +1,4 @@
-"""Tasks: the environments that agents act in. A new task needs one file and one line in `TASKS`."""
+"""Tasks: the environments that agents act in. A new task needs one file and one line in `catalogue.TASKS`."""
 
 import dataclasses
 import difflib
@@ -8,12 +8,14 @@ from typing import Any, Protocol, runtime_checkable
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.imports import declared, declared_name, load_declared, path
+from beliefrl import catalogue
+from beliefrl.catalogue import KNOWN, MASKS, PREFIX, ROBOTS, Known
+from beliefrl.catalogue import TASK_GROUP as GROUP
+from beliefrl.catalogue import our_task_names as our_names
+from beliefrl.catalogue import task_names as names
+from beliefrl.imports import declared, declared_name, load, load_declared, path
 from beliefrl.tasks import registered
-from beliefrl.tasks.cartpole import CartPole
 from beliefrl.tasks.gymnasium import GymnasiumTask
-from beliefrl.tasks.pendulum import Pendulum
-from beliefrl.tasks.target_reaching import TargetReaching
 from beliefrl.types import Spec, UserError, check_indices, said, tuples
 
 
@@ -116,34 +118,12 @@ def entry_names(task: Any) -> tuple[str, ...]:
     return tuple(names)
 
 
-TASKS: dict[str, type[Any]] = {
-    "pendulum": Pendulum,
-    "cartpole": CartPole,
-    "target-reaching": TargetReaching,
-}
-GROUP = "beliefrl.tasks"  # of entry points
-MASKS = {"-v": "velocities", "-p": "positions"}
-
-
-def names() -> dict[str, str]:
-    """The name and a description of every task: ours, then those of installed packages, which are not imported."""
-    ours = our_names()
-    return ours | {name: f"{value}, of an installed package." for name, value in declared(GROUP, ours).items()}
-
-
-def our_names() -> dict[str, str]:
-    """The name and a description of this library's tasks, in the order of the paper's table (Appendix B)."""
-    listed = {}
-    for name, task in TASKS.items():
-        listed |= _masked(name, (task.__doc__ or "").split("\n")[0], task)
-    for name, robot in registered.ROBOTS.items():
-        listed |= _masked(name, robot.about + " Needs the extra `robots`.", robot)
-    return listed
+TASKS: dict[str, type[Any]] = {name: load(path) for name, path in catalogue.TASKS.items()}
 
 
 def knows(name: str) -> bool:
     """Whether `make` may know a task of that name."""
-    return name.startswith(registered.PREFIX) or name in our_names() or _declared(name) is not None
+    return name.startswith(PREFIX) or name in our_names() or _declared(name) is not None
 
 
 def _declared(name: str) -> tuple[str, str] | None:
@@ -165,25 +145,11 @@ def _declared_class(name: str, value: str) -> type:
     return kind
 
 
-def _masked(name: str, about: str, task: Any) -> dict[str, str]:
-    """The description of a task, and of its versions with part of the observation."""
-    velocities, positions = masks(task)
-    listed = {name: about}
-    if velocities:
-        listed[f"{name}-v"] = f"{name}, velocities only: entries {_listed(velocities)} of its observation"
-        listed[f"{name}-p"] = f"{name}, no velocities: entries {_listed(positions)} of its observation"
-    return listed
-
-
 def masks(task: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """The indices of the velocities and of all other entries; empty if the task does not define them."""
-    if isinstance(task, registered.Known):
+    if isinstance(task, Known):
         return task.velocities, task.positions
     return tuple(getattr(task, "VELOCITIES", ())), tuple(getattr(task, "POSITIONS", ()))
-
-
-def _listed(indices: tuple[int, ...]) -> str:
-    return ", ".join(map(str, indices))
 
 
 def make(name: str, /, observe: Sequence[int | str] | int | str | None = None, **constants: Any) -> Any:
@@ -206,13 +172,13 @@ def make(name: str, /, observe: Sequence[int | str] | int | str | None = None, *
 
 
 def _make(name: str, constants: dict[str, Any]) -> Any:
-    if name.startswith(registered.PREFIX):
-        return registered.make(name.removeprefix(registered.PREFIX), constants)
+    if name.startswith(PREFIX):
+        return registered.make(name.removeprefix(PREFIX), constants)
     if name not in our_names():
         return _make_declared(name, constants)
     base, mask = (name[:-2], MASKS[name[-2:]]) if name[-2:] in MASKS else (name, None)
-    if base in registered.ROBOTS:
-        robot = registered.ROBOTS[base]
+    if base in ROBOTS:
+        robot = ROBOTS[base]
         task = registered.make(robot.id, constants, name)
         return task if mask is None else dataclasses.replace(task, indices=getattr(robot, mask))
     task = _built(base, TASKS[base], constants)
@@ -260,7 +226,7 @@ def _indices(name: str, task: Any, observe: Sequence[int | str] | int | str) -> 
     """The indices that `observe` means for a task."""
     given = [observe] if isinstance(observe, str | int) else list(observe)
     if len(given) == 1 and given[0] in MASKS.values():
-        known: Any = registered.KNOWN.get(name.removeprefix(registered.PREFIX), registered.ROBOTS.get(name))
+        known: Any = KNOWN.get(name.removeprefix(PREFIX), ROBOTS.get(name))
         velocities, positions = masks(known or TASKS.get(name) or task)
         if not velocities:
             raise UserError(f"{name} does not define which entries are {given[0]}: give their indices.")
@@ -294,7 +260,7 @@ def describe(task: Any) -> dict[str, Any]:
 
 
 def _describe_gymnasium(task: GymnasiumTask) -> dict[str, Any]:
-    robot = registered.ROBOTS.get(task.name.removesuffix("-v").removesuffix("-p"))
+    robot = ROBOTS.get(task.name.removesuffix("-v").removesuffix("-p"))
     whole = robot is not None and task.indices == {"-v": robot.velocities, "-p": robot.positions}.get(task.name[-2:])
     observe = None if whole or task.indices is None else list(task.indices)
     return {"task": task.name, "constants": dict(task.arguments), "observe": observe}

@@ -160,24 +160,3 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         if self._window is not None:
             self._window.close()
             self._window = None
-
-
-def ids() -> dict[str, str]:
-    """{Gymnasium id: task name} of all tasks of this library, such as {"BeliefRL/PendulumV-v0": "pendulum-v"}."""
-    return {
-        f"BeliefRL/{task.__name__}{mask[1:].upper()}-v0": name + mask
-        for name, task in tasks.TASKS.items()
-        for mask in ("", *(tasks.MASKS if hasattr(task, "VELOCITIES") else ()))
-    }
-
-
-def register() -> None:
-    """Register all tasks of this library in Gymnasium. Repeated calls have no effect."""
-    for identifier, name in ids().items():
-        if identifier not in gymnasium.registry:
-            gymnasium.register(
-                identifier,
-                entry_point="beliefrl.tasks.environment:TaskEnvironment",
-                max_episode_steps=tasks.make(name).spec.max_steps,
-                kwargs={"task": name},
-            )

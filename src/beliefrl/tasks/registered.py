@@ -14,75 +14,14 @@ import os
 import pathlib
 import sys
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
 from gymnasium import error
 
+from beliefrl.catalogue import BULLET, KNOWN, PREFIX
+from beliefrl.errors import UserError, one_line, said
 from beliefrl.tasks.gymnasium import GymnasiumTask
-from beliefrl.types import UserError, one_line, said
-
-PREFIX = "gym:"
-BULLET = "pybullet_envs_gymnasium"
-
-
-class Known(NamedTuple):
-    """An environment with known velocities and positions in its observation."""
-
-    id: str
-    about: str
-    velocities: tuple[int, ...]
-    positions: tuple[int, ...]  # all other entries
-    extra: str | None = None  # the extra of this package that it needs
-
-
-def _known(id: str, about: str, size: int, velocities: tuple[int, ...], extra: str | None = None) -> Known:
-    return Known(id, about, velocities, tuple(i for i in range(size) if i not in velocities), extra)
-
-
-def _bullet(robot: str, joints: int, feet: int) -> Known:
-    velocities = (3, 4, 5, *range(9, 8 + 2 * joints, 2))
-    about = f"PyBullet's {robot}: run forward."
-    id = f"{BULLET}:{robot}BulletEnv-v0"
-    return _known(id, about, 8 + 2 * joints + feet, velocities, "robots")
-
-
-def _mujoco(id: str, size: int, velocities: tuple[int, ...]) -> Known:
-    return _known(id, f"MuJoCo's {id.split('-')[0]}.", size, velocities, "mujoco")
-
-
-ANY = "gym:ID or gym:PACKAGE:ID"
-
-ROBOTS: dict[str, Known] = {
-    "hopper": _bullet("Hopper", joints=3, feet=1),
-    "walker2d": _bullet("Walker2D", joints=6, feet=2),
-    "ant": _bullet("Ant", joints=8, feet=4),
-    "halfcheetah": _bullet("HalfCheetah", joints=6, feet=6),
-}
-
-GYMNASIUMS: tuple[Known, ...] = (
-    _known("Pendulum-v1", "Gymnasium's pendulum.", 3, (2,)),
-    _known("MountainCarContinuous-v0", "A car too weak for its hill.", 2, (1,)),
-    _mujoco("InvertedPendulum-v5", 4, (2, 3)),
-    _mujoco("InvertedDoublePendulum-v5", 9, (5, 6, 7)),
-    _mujoco("Swimmer-v5", 8, tuple(range(3, 8))),
-    _mujoco("Hopper-v5", 11, tuple(range(5, 11))),
-    _mujoco("HalfCheetah-v5", 17, tuple(range(8, 17))),
-    _mujoco("Walker2d-v5", 17, tuple(range(8, 17))),
-    _mujoco("Ant-v5", 105, tuple(range(13, 27))),
-)
-
-KNOWN: dict[str, Known] = {known.id: known for known in (*ROBOTS.values(), *GYMNASIUMS)}
-
-
-def names() -> dict[str, str]:
-    """The name and a description of each Gymnasium environment with known velocities, and of the form "gym:ID"."""
-    listed = {}
-    for known in GYMNASIUMS:
-        extra = f" Needs the extra `{known.extra}`." if known.extra else ""
-        listed[PREFIX + known.id] = f"{known.about} --observe velocities or positions.{extra}"
-    listed[ANY] = "Any other Gymnasium environment with bounded continuous actions; --observe takes indices."
-    return listed
 
 
 def ids() -> list[str]:

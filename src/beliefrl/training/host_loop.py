@@ -51,7 +51,7 @@ def program(
     return Program(
         begin=loop.begin,
         explore=loop.explore,
-        pretrain=jax.jit(jax.vmap(partial(phases.pretrain, agent), in_axes=(0, None, None)), donate_argnums=0),
+        pretrain=jax.jit(partial(phases.pretrain, agent), donate_argnums=0),
         refresh=jax.jit(jax.vmap(partial(phases.refresh, agent, task.spec)), donate_argnums=0),
         learn=loop.learn,
         evaluate=partial(evaluation.play, episodes=episodes),

@@ -8,6 +8,9 @@ The step counter stays outside what is mapped over seeds, and each phase is a co
 for a stretch of steps whose number is an argument: one compilation serves all stretches, and no result depends on
 how the training is cut into them. Random keys are derived from the seed's key and the running number of the step.
 `schedule` decides which phase is called when.
+
+The loops over steps, updates and cycles are outside what is mapped over seeds: JAX traces the body of a loop that is
+mapped three times, and that of a loop over a mapped body once.
 """
 
 from collections.abc import Callable
@@ -44,10 +47,10 @@ class SeedState(NamedTuple):
 
 
 class Stretch(NamedTuple):
-    """Metrics and episodes of a stretch of steps, of one seed."""
+    """Metrics and episodes of a stretch of steps; leaves have a leading axis `seed`."""
 
     metrics: Metrics  # means over its updates
-    episodes: Episode | None  # leaves (stretch,): one entry a step, done only where an episode ended
+    episodes: Episode | None  # leaves (seed, stretch): one entry a step, done only where an episode ended
 
 
 def begin(agent: Agent, task: Task, capacity: int, key: Key[Array, ""]) -> SeedState:
@@ -63,10 +66,10 @@ def seed_of(
     return SeedState(agent.init(key_state, spec), actor, ring.init(rollout.stored(agent, actor), capacity), key)
 
 
-def _no_episodes(agent: Agent) -> Episode:
-    length = stretch_length(agent)
-    none = jnp.zeros(length, bool)
-    return Episode(none, jnp.zeros(length), jnp.zeros(length, int), none)
+def _no_episodes(agent: Agent, seeds: SeedState) -> Episode:
+    shape = len(seeds.key), stretch_length(agent)
+    none = jnp.zeros(shape, bool)
+    return Episode(none, jnp.zeros(shape), jnp.zeros(shape, int), none)
 
 
 def _write(log: Episode, index: Int[Array, ""], episode: Episode) -> Episode:
@@ -81,18 +84,24 @@ ACT, UPDATE, SAMPLE, CYCLE, PRETRAIN, REFRESH, EVALUATE, REVIVE = range(8)  # pu
 
 
 def explore(
-    agent: Agent, task: Task, seed: SeedState, first: Int[Array, ""], steps: Int[Array, ""]
+    agent: Agent, task: Task, seeds: SeedState, first: Int[Array, ""], steps: Int[Array, ""]
 ) -> tuple[SeedState, Stretch]:
     """Environment steps `first` to `first + steps` without updates; at most `stretch_length` of them."""
 
     def step(i, carry):
-        seed, log = carry
-        key = step_key(seed.key, first + i, ACT)
-        actor, replay, episode = rollout.advance(agent, task, seed.state, seed.actor, seed.replay, key)
-        return seed._replace(actor=actor, replay=replay), _write(log, i, episode)
+        return jax.vmap(partial(_act, agent, task), in_axes=(0, 0, None, None))(*carry, first + i, i)
 
-    seed, log = jax.lax.fori_loop(0, steps, step, (seed, _no_episodes(agent)))
-    return seed, Stretch({}, log)
+    seeds, log = jax.lax.fori_loop(0, steps, step, (seeds, _no_episodes(agent, seeds)))
+    return seeds, Stretch({}, log)
+
+
+def _act(
+    agent: Agent, task: Task, seed: SeedState, log: Episode, step: Int[Array, ""], index: Int[Array, ""]
+) -> tuple[SeedState, Episode]:
+    """One environment step, whose entry in the log is at `index`."""
+    key = step_key(seed.key, step, ACT)
+    actor, replay, episode = rollout.advance(agent, task, seed.state, seed.actor, seed.replay, key)
+    return seed._replace(actor=actor, replay=replay), _write(log, index, episode)
 
 
 def _sum_metrics(shapes: Any) -> Metrics:
@@ -100,11 +109,12 @@ def _sum_metrics(shapes: Any) -> Metrics:
 
 
 def pretrain(
-    agent: Agent, seed: SeedState, first: Int[Array, ""], updates: Int[Array, ""]
+    agent: Agent, seeds: SeedState, first: Int[Array, ""], updates: Int[Array, ""]
 ) -> tuple[SeedState, Metrics]:
     """Updates `first` to `first + updates` of the pre-training; metrics are their means."""
 
     @partial(jax.jit, inline=True)  # traced once, for its shapes and for the loop
+    @partial(jax.vmap, in_axes=(0, None))
     def update(seed: SeedState, number: Int[Array, ""]) -> tuple[SeedState, Metrics]:
         key_sample, key = jax.random.split(step_key(seed.key, number, PRETRAIN))
         windows = ring.sample(seed.replay, key_sample, agent.pretrain_windows, agent.window)
@@ -112,13 +122,13 @@ def pretrain(
         return seed._replace(state=state), metrics
 
     def step(i, carry):
-        seed, totals = carry
-        seed, metrics = update(seed, first + i)
-        return seed, jax.tree.map(jnp.add, totals, metrics)
+        seeds, totals = carry
+        seeds, metrics = update(seeds, first + i)
+        return seeds, jax.tree.map(jnp.add, totals, metrics)
 
-    totals = _sum_metrics(jax.eval_shape(update, seed, first)[1])
-    seed, totals = jax.lax.fori_loop(0, updates, step, (seed, totals))
-    return seed, jax.tree.map(lambda total: total / jnp.maximum(updates, 1), totals)
+    totals = _sum_metrics(jax.eval_shape(update, seeds, first)[1])
+    seeds, totals = jax.lax.fori_loop(0, updates, step, (seeds, totals))
+    return seeds, jax.tree.map(lambda total: total / jnp.maximum(updates, 1), totals)
 
 
 def refresh(agent: Agent, spec: Spec, seed: SeedState) -> SeedState:
@@ -130,19 +140,21 @@ def refresh(agent: Agent, spec: Spec, seed: SeedState) -> SeedState:
 
 
 def learn(
-    agent: Agent, task: Task, seed: SeedState, first: Int[Array, ""], cycles: Int[Array, ""]
+    agent: Agent, task: Task, seeds: SeedState, first: Int[Array, ""], cycles: Int[Array, ""]
 ) -> tuple[SeedState, Stretch]:
     """`cycles` cycles of learning from environment step `first` on; at most `stretch_length` steps in all."""
-    one_cycle = jax.jit(partial(_cycle, agent, task), inline=True)  # traced once, for its shapes and for the loop
-    shapes = jax.eval_shape(one_cycle, seed, _no_episodes(agent), first, first)[2]
+    # Traced once, for its shapes and for the loop.
+    one_cycle = jax.jit(jax.vmap(partial(_cycle, agent, task), in_axes=(0, 0, None, None)), inline=True)
+    none = _no_episodes(agent, seeds)
+    shapes = jax.eval_shape(one_cycle, seeds, none, first, first)[2]
 
     def step(i, carry):
-        seed, log, totals = carry
-        seed, log, metrics = one_cycle(seed, log, first + i * agent.cycle, i * agent.cycle)
-        return seed, log, jax.tree.map(jnp.add, totals, metrics)
+        seeds, log, totals = carry
+        seeds, log, metrics = one_cycle(seeds, log, first + i * agent.cycle, i * agent.cycle)
+        return seeds, log, jax.tree.map(jnp.add, totals, metrics)
 
-    seed, log, totals = jax.lax.fori_loop(0, cycles, step, (seed, _no_episodes(agent), _sum_metrics(shapes)))
-    return seed, Stretch(jax.tree.map(lambda total: total / jnp.maximum(cycles, 1), totals), log)
+    seeds, log, totals = jax.lax.fori_loop(0, cycles, step, (seeds, none, _sum_metrics(shapes)))
+    return seeds, Stretch(jax.tree.map(lambda total: total / jnp.maximum(cycles, 1), totals), log)
 
 
 def _cycle(
@@ -155,10 +167,7 @@ def _cycle(
     """
 
     def act(step, carry):
-        seed, log = carry
-        key = step_key(seed.key, step, ACT)
-        actor, replay, episode = rollout.advance(agent, task, seed.state, seed.actor, seed.replay, key)
-        return seed._replace(actor=actor, replay=replay), _write(log, index + step - first, episode)
+        return _act(agent, task, *carry, step, index + step - first)
 
     seed, log = jax.lax.fori_loop(first, first + agent.cycle, act, (seed, log))
     state, metrics = learn_cycle(agent, seed, first)
@@ -211,17 +220,13 @@ class Program(NamedTuple):
 
 def compile_program(agent: Agent, task: Task, capacity: int, episodes: int) -> Program:
     """The phases as compiled functions. They donate the memory of the seeds that they are given."""
-
-    def mapped(function: Callable[..., Any], numbers: int) -> Callable[..., Any]:
-        return jax.jit(jax.vmap(function, in_axes=(0, *[None] * numbers)), donate_argnums=0)
-
     start = jax.jit(jax.vmap(partial(begin, agent, task, capacity)))
     return Program(
         begin=start,
-        explore=mapped(partial(explore, agent, task), 2),
-        pretrain=mapped(partial(pretrain, agent), 2),
-        refresh=mapped(partial(refresh, agent, task.spec), 0),
-        learn=mapped(partial(learn, agent, task), 2),
+        explore=jax.jit(partial(explore, agent, task), donate_argnums=0),
+        pretrain=jax.jit(partial(pretrain, agent), donate_argnums=0),
+        refresh=jax.jit(jax.vmap(partial(refresh, agent, task.spec)), donate_argnums=0),
+        learn=jax.jit(partial(learn, agent, task), donate_argnums=0),
         evaluate=jax.jit(jax.vmap(partial(evaluate, agent, task, episodes=episodes))),
         shapes=partial(jax.eval_shape, start),
     )

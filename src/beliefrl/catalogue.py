@@ -1,0 +1,181 @@
+"""What there is, by name: agents, tasks, and the Gymnasium environments whose velocities are known.
+
+Nothing here imports JAX, so the command line lists names at once. What an agent or a task says of itself is read from
+the source of its class.
+"""
+
+import ast
+import difflib
+import functools
+import pathlib
+from typing import Any, NamedTuple
+
+from beliefrl.errors import UserError
+from beliefrl.imports import declared
+
+AGENT_GROUP = "beliefrl.agents"  # of entry points
+TASK_GROUP = "beliefrl.tasks"
+
+
+class Named(NamedTuple):
+    """What an agent's name stands for."""
+
+    path: str  # module:Class
+    about: str = ""  # empty: the first line of the class's docstring
+    hyperparameters: dict[str, Any] = {}  # that differ from the class's defaults
+
+
+VRM = "beliefrl.agents.vrm:VRMAgent"
+AGENTS: dict[str, Named] = {
+    "vrm": Named(VRM),
+    "sac-mlp": Named("beliefrl.agents.sac_mlp:SACMLPAgent"),
+    "sac-lstm": Named("beliefrl.agents.sac_lstm:SACLSTMAgent"),
+    "slac": Named("beliefrl.agents.slac:SLACAgent"),
+    "vrm-single": Named(VRM, "Ablation: one model that is pre-trained and keeps learning.", {"models": "single"}),
+    "vrm-first": Named(VRM, "Ablation: only the first-impression model.", {"models": "first"}),
+    "vrm-keep": Named(VRM, "Ablation: only the keep-learning model.", {"models": "keep"}),
+    "vrm-deterministic": Named(
+        VRM, "Ablation: models without noise, trained on squared error.", {"deterministic": True}
+    ),
+}
+TASKS: dict[str, str] = {
+    "pendulum": "beliefrl.tasks.pendulum:Pendulum",
+    "cartpole": "beliefrl.tasks.cartpole:CartPole",
+    "target-reaching": "beliefrl.tasks.target_reaching:TargetReaching",
+}
+MASKS = {"-v": "velocities", "-p": "positions"}
+
+
+def agent_names() -> dict[str, str]:
+    """Every agent's name with a sentence on it: ours, then those of installed packages, which are not imported."""
+    ours = {name: agent.about or written(agent.path)["__doc__"] for name, agent in AGENTS.items()}
+    return ours | _declared(AGENT_GROUP, ours)
+
+
+def check_agent(name: str) -> None:
+    """Raise a UserError where no agent has that name. A `module:Class` is not imported, so it may be no agent."""
+    if name in AGENTS or ":" in name:
+        return
+    there = agent_names()
+    if name not in there:
+        near = difflib.get_close_matches(name, there, n=1)
+        every = ", ".join(there)
+        hint = f"did you mean {near[0]}?" if near else f"there is {every}, and MODULE:CLASS for one of your own."
+        raise UserError(f"There is no agent {name!r}: {hint}")
+
+
+def task_names() -> dict[str, str]:
+    """The name and a description of every task: ours, then those of installed packages, which are not imported."""
+    ours = our_task_names()
+    return ours | _declared(TASK_GROUP, ours)
+
+
+def our_task_names() -> dict[str, str]:
+    """The name and a description of this library's tasks, in the order of the paper's table (Appendix B)."""
+    listed = {}
+    for name, path in TASKS.items():
+        task = written(path)
+        listed |= _masked(name, task["__doc__"], task.get("VELOCITIES", ()), task.get("POSITIONS", ()))
+    for name, robot in ROBOTS.items():
+        listed |= _masked(name, robot.about + " Needs the extra `robots`.", robot.velocities, robot.positions)
+    return listed
+
+
+def environment_names() -> dict[str, str]:
+    """The name and a description of each Gymnasium environment with known velocities, and of the form "gym:ID"."""
+    listed = {}
+    for known in GYMNASIUMS:
+        extra = f" Needs the extra `{known.extra}`." if known.extra else ""
+        listed[PREFIX + known.id] = f"{known.about} --observe velocities or positions.{extra}"
+    listed[ANY] = "Any other Gymnasium environment with bounded continuous actions; --observe takes indices."
+    return listed
+
+
+@functools.cache
+def written(path: str) -> dict[str, Any]:
+    """What stands in the source of a class of ours, module:Class: its constants, and its docstring's first line.
+
+    A dictionary {name: value} of those annotated attributes that are literals, and "__doc__". Imports nothing.
+    """
+    module, _, name = path.partition(":")
+    file = pathlib.Path(__file__).parent.joinpath(*module.split(".")[1:]).with_suffix(".py")
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    kind = next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name)
+    values: dict[str, Any] = {"__doc__": (ast.get_docstring(kind) or "").split("\n")[0]}
+    for node in kind.body:
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.value is not None:
+            try:
+                values[node.target.id] = ast.literal_eval(node.value)
+            except ValueError:  # computed
+                continue
+    return values
+
+
+def _declared(group: str, ours: dict[str, str]) -> dict[str, str]:
+    return {name: f"{value}, of an installed package." for name, value in declared(group, ours).items()}
+
+
+def _masked(name: str, about: str, velocities: tuple[int, ...], positions: tuple[int, ...]) -> dict[str, str]:
+    """The description of a task, and of its versions with part of the observation."""
+    listed = {name: about}
+    if velocities:
+        listed[f"{name}-v"] = f"{name}, velocities only: entries {_listed(velocities)} of its observation"
+        listed[f"{name}-p"] = f"{name}, no velocities: entries {_listed(positions)} of its observation"
+    return listed
+
+
+def _listed(indices: tuple[int, ...]) -> str:
+    return ", ".join(map(str, indices))
+
+
+PREFIX = "gym:"
+BULLET = "pybullet_envs_gymnasium"
+
+
+class Known(NamedTuple):
+    """An environment with known velocities and positions in its observation."""
+
+    id: str
+    about: str
+    velocities: tuple[int, ...]
+    positions: tuple[int, ...]  # all other entries
+    extra: str | None = None  # the extra of this package that it needs
+
+
+def _known(id: str, about: str, size: int, velocities: tuple[int, ...], extra: str | None = None) -> Known:
+    return Known(id, about, velocities, tuple(i for i in range(size) if i not in velocities), extra)
+
+
+def _bullet(robot: str, joints: int, feet: int) -> Known:
+    velocities = (3, 4, 5, *range(9, 8 + 2 * joints, 2))
+    about = f"PyBullet's {robot}: run forward."
+    id = f"{BULLET}:{robot}BulletEnv-v0"
+    return _known(id, about, 8 + 2 * joints + feet, velocities, "robots")
+
+
+def _mujoco(id: str, size: int, velocities: tuple[int, ...]) -> Known:
+    return _known(id, f"MuJoCo's {id.split('-')[0]}.", size, velocities, "mujoco")
+
+
+ANY = "gym:ID or gym:PACKAGE:ID"
+
+ROBOTS: dict[str, Known] = {
+    "hopper": _bullet("Hopper", joints=3, feet=1),
+    "walker2d": _bullet("Walker2D", joints=6, feet=2),
+    "ant": _bullet("Ant", joints=8, feet=4),
+    "halfcheetah": _bullet("HalfCheetah", joints=6, feet=6),
+}
+
+GYMNASIUMS: tuple[Known, ...] = (
+    _known("Pendulum-v1", "Gymnasium's pendulum.", 3, (2,)),
+    _known("MountainCarContinuous-v0", "A car too weak for its hill.", 2, (1,)),
+    _mujoco("InvertedPendulum-v5", 4, (2, 3)),
+    _mujoco("InvertedDoublePendulum-v5", 9, (5, 6, 7)),
+    _mujoco("Swimmer-v5", 8, tuple(range(3, 8))),
+    _mujoco("Hopper-v5", 11, tuple(range(5, 11))),
+    _mujoco("HalfCheetah-v5", 17, tuple(range(8, 17))),
+    _mujoco("Walker2d-v5", 17, tuple(range(8, 17))),
+    _mujoco("Ant-v5", 105, tuple(range(13, 27))),
+)
+
+KNOWN: dict[str, Known] = {known.id: known for known in (*ROBOTS.values(), *GYMNASIUMS)}

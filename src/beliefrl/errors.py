@@ -1,0 +1,32 @@
+"""A user's mistake, and how text from elsewhere is quoted in its message. Imports nothing slow."""
+
+import re
+from typing import Any
+
+ESCAPES = re.compile(r"(?:\x1b\[|\x9b)[0-?]*[ -/]*[@-~]|\x1b\].*?(?:\x07|\x1b\\)", re.DOTALL)  # colours, titles, links
+
+
+class UserError(Exception):
+    """A mistake that the user can mend. Its message is one sentence: what was wrong, and what to do."""
+
+
+class UsageError(Exception):
+    """A mistake on the command line; the message is one sentence."""
+
+
+def said(error: BaseException) -> str:
+    """An exception of other code, quoted on one line, without control characters."""
+    text = one_line(str(error))[:300].rstrip(".")
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+def one_line(text: str) -> str:
+    """Text from elsewhere on one line, without terminal escapes and other control characters."""
+    text = " ".join(ESCAPES.sub("", text).split())
+    return "".join(character for character in text if character.isprintable())
+
+
+def short(value: Any) -> str:
+    """How a value is written, on one line of at most 80 characters."""
+    text = one_line(repr(value))
+    return text if len(text) <= 80 else f"{text[:77]}..."
