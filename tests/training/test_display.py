@@ -3,9 +3,9 @@
 import io
 
 import pytest
+from beliefrl.commands.display import TrainingDisplay
 from rich.console import Console
 
-from beliefrl.commands.display import TrainingDisplay
 from beliefrl.training.schedule import Event, Phase
 
 
