@@ -14,8 +14,9 @@ project = html_title = "BeliefRL"
 release = version = beliefrl.__version__
 html_show_copyright = False
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.viewcode", "sphinx_copybutton", "docstrings"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.viewcode", "sphinx_copybutton", "docstrings"]
 exclude_patterns = ["_build"]
+nb_execution_mode = "off"  # the notebook is shown with the outputs that it has
 myst_heading_anchors = 3
 nitpicky = True
 nitpick_ignore_regex = [
