@@ -2,7 +2,7 @@
 
     pip install beliefrl
     python examples/02_a_task_in_jax.py             # 6,000 steps
-    python examples/02_a_task_in_jax.py --quick     # 1,500 steps, enough to see the difference: QUICK
+    python examples/02_a_task_in_jax.py --quick     # 1,000 steps, enough to see the difference: QUICK
 
 The first observation of an episode shows whether a lamp is on the left or on the right. After some steps in the dark,
 the agent must point to it. Without memory the best return is 0, with memory it is 1. The agents are small ones: an LSTM
@@ -55,7 +55,7 @@ MEMORY = {"d_size": 32, "lr_lstm": 1e-3, "seq_len": 14, "burn_in": 7, "batch_siz
 
 def main(quick: bool = False) -> None:
     """Train an agent with memory and one without, two seeds of each side by side."""
-    options = {"steps": 1_500 if quick else 6_000, "seeds": 2, "eval_every": 500, "eval_episodes": 50}
+    options = {"steps": 1_000 if quick else 6_000, "seeds": 2, "eval_every": 500, "eval_episodes": 50}
     memory = beliefrl.train(beliefrl.make_agent("sac-lstm", **SMALL, **FAST, **MEMORY), Lamp(), **options)
     blind = beliefrl.train(beliefrl.make_agent("sac-mlp", **SMALL, **FAST), Lamp(), **options)
     for name, run in (("with memory", memory), ("without memory", blind)):
