@@ -2,7 +2,7 @@
 
     pip install beliefrl
     python examples/01_your_own_environment.py             # 6,000 steps
-    python examples/01_your_own_environment.py --quick     # 600 steps, to see it run: QUICK
+    python examples/01_your_own_environment.py --quick     # 600 steps of a small agent, to see it run: QUICK
 
 A registered environment needs no Python code. Here `my_robots` is a module that registers one:
 
@@ -48,7 +48,8 @@ def main(quick: bool = False) -> None:
     """Train without the speed. The environment never ends an episode, so this sets a time limit of 60 steps."""
     task = beliefrl.GymnasiumTask(Cart, indices=(0,), max_steps=60)
     if quick:
-        agent = beliefrl.make_agent("sac-lstm", step_start_rl=300, pretrain_updates=100)
+        small = {"d_size": 32, "seq_len": 16, "burn_in": 16, "policy_layers": (32,), "value_layers": (32,)}
+        agent = beliefrl.make_agent("sac-lstm", step_start_rl=300, pretrain_updates=0, **small)
         run = beliefrl.train(agent, task, "runs/cart-quick", resume=True, steps=600, eval_every=300)
     else:
         run = beliefrl.train("sac-lstm", task, "runs/cart", resume=True, steps=6_000, eval_every=1_000)

@@ -13,7 +13,7 @@ from rich.console import Console
 from beliefrl import agents, evaluate, train
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import screen as screens
-from beliefrl.training.display import TrainingDisplay
+from beliefrl.training.display import TrainingDisplay, results_table
 from beliefrl.training.rollout import Episode
 from beliefrl.training.schedule import Event, Phase
 from beliefrl.training.screen import Notebook, Screen, Terminal
@@ -111,6 +111,9 @@ def test_an_evaluation_that_takes_seconds_shows_how_many_episodes_are_over(tmp_p
     assert "2 of 4 episodes are over" in lines
 
 
+FLAT = {"mean": 1.0, "sem": None, "seeds": [1.0], "success": None}
+
+
 def evaluation(value):
     return Episode(*(np.full((1, 2, 3), each) for each in (True, value, 10, False)))
 
@@ -147,7 +150,8 @@ def cells(monkeypatch):
     return made
 
 
-def test_a_notebook_shows_the_status_the_evaluations_and_the_curve(tmp_path, cells):
+def test_a_notebook_shows_the_status_the_evaluations_and_the_curve(tmp_path, cells, monkeypatch):
+    monkeypatch.setenv("FORCE_COLOR", "1")  # as a notebook's kernel does
     run = a_run(tmp_path / "run", [[(20, [-7.0])]], steps=100)
     display = TrainingDisplay(Notebook(console()), run)
     with display.screen:
@@ -159,4 +163,7 @@ def test_a_notebook_shows_the_status_the_evaluations_and_the_curve(tmp_path, cel
         assert lines[0].endswith("step 40: return -7.0 sampled, -7.0 mode")
         assert "step 60/100" in lines[1]
         assert cells[1]["image/png"].startswith("iVBORw0KGgo")  # base64 of PNG
-    assert cells[0]["text/plain"].splitlines() == lines[:1]
+        display.screen.show(results_table(dict.fromkeys(("sampled", "mode"), FLAT), [0], "title"))
+    assert cells[0]["text/plain"].splitlines()[0] == lines[0]
+    assert "step 60/100" not in cells[0]["text/plain"]
+    assert "\x1b" not in cells[0]["text/plain"]

@@ -119,7 +119,7 @@ class Notebook(Screen):
             self._display("text", {"text/plain": text} if text else {})
 
     def _text(self, what: RenderableType) -> str:
-        console = Console(file=io.StringIO(), width=100, force_jupyter=False)
+        console = Console(file=io.StringIO(), width=100, color_system=None, force_terminal=False, force_jupyter=False)
         with console.capture() as captured:
             console.print(what, markup=False, highlight=False, soft_wrap=isinstance(what, str))
         return "".join(line.rstrip() + "\n" for line in captured.get().splitlines())
