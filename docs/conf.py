@@ -1,6 +1,7 @@
 """How the pages are built: `sphinx-build -W --keep-going docs docs/_build`. Nothing is fetched, then or when read."""
 
 import pathlib
+import shutil
 import sys
 
 import jax
@@ -9,6 +10,19 @@ sys.path.insert(0, str(pathlib.Path(__file__).parent))
 jax.Array.__name__ = "Array"  # jaxlib._jax.Array before JAX 0.11; jaxtyping names its shapes after it
 
 import beliefrl  # noqa: E402 - with that name
+
+NOTEBOOK = "../examples/tutorial.ipynb"  # Sphinx shows only what lies in its own folder, so it gets a copy
+shutil.copy(pathlib.Path(__file__).parent / NOTEBOOK, pathlib.Path(__file__).parent)
+
+
+def setup(app):
+    """Let links to the notebook lead to the copy."""
+
+    def link(app, name, content):
+        content[0] = content[0].replace(f"]({NOTEBOOK})", "](tutorial.ipynb)")
+
+    app.connect("source-read", link)
+
 
 project = html_title = "BeliefRL"
 release = version = beliefrl.__version__
