@@ -8,7 +8,9 @@ import ast
 import dataclasses
 import importlib
 import inspect
+import pathlib
 import re
+import shutil
 import textwrap
 from collections.abc import Iterator
 from typing import Any
@@ -21,12 +23,17 @@ jax.Array.__name__ = "Array"  # jaxlib._jax.Array before JAX 0.11; jaxtyping sho
 
 import beliefrl  # noqa: E402 - after the name is set
 
+NOTEBOOK = "../examples/tutorial.ipynb"  # Sphinx shows only what lies in its own folder, so it gets a copy
+shutil.copy(pathlib.Path(__file__).parent / NOTEBOOK, pathlib.Path(__file__).parent)
+
+
 project = html_title = "BeliefRL"
 release = version = beliefrl.__version__
 html_show_copyright = False
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.viewcode", "sphinx_copybutton"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.viewcode", "sphinx_copybutton"]
 exclude_patterns = ["_build"]
+nb_execution_mode = "off"  # the notebook is shown with the outputs that it has
 myst_heading_anchors = 3
 nitpicky = True
 nitpick_ignore_regex = [
@@ -57,10 +64,16 @@ STAR = re.compile(r"(?<![`\w])\*(?=\w)")  # in a shape such as (*batch, obs), no
 
 def setup(app: Sphinx) -> dict[str, Any]:
     """Connect the functions below. Sphinx calls this."""
+    app.connect("source-read", link_to_copy)
     app.connect("autodoc-process-docstring", rewrite)
     app.connect("autodoc-process-signature", without_fields)
     app.connect("autodoc-skip-member", skip_methods_of_agents)
     return {"parallel_read_safe": True}
+
+
+def link_to_copy(app: Sphinx, page: str, content: list[str]) -> None:
+    """Let links to the notebook lead to the copy."""
+    content[0] = content[0].replace(f"]({NOTEBOOK})", "](tutorial.ipynb)")
 
 
 def rewrite(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:

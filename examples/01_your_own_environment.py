@@ -1,13 +1,15 @@
 """Train on your own environment, which has Gymnasium's interface: here a cart that must drive to a mark and stop there.
 
     pip install beliefrl
-    python examples/01_your_own_environment.py                  # 6,000 steps: about six minutes
-    python examples/01_your_own_environment.py --steps 300      # a short test run
+    python examples/01_your_own_environment.py             # 6,000 steps
+    python examples/01_your_own_environment.py --quick     # 600 steps of a small agent, to see it run: QUICK
 
 A registered environment needs no Python code. Here `my_robots` is a module that registers one:
 
     beliefrl train vrm gym:my_robots:Cart-v0 --observe 0 --seeds 2
     beliefrl train vrm gym:MountainCarContinuous-v0 --observe 0 --constants max_episode_steps=500
+
+A second start goes on with the run in runs/cart: it repeats nothing that is done.
 
 The environment receives actions in the range of its own Box. The agent sees only the entries `--observe` of the
 observation (in Python: `indices`). Here it does not see the cart's speed, and must infer it from past positions.
@@ -42,10 +44,15 @@ class Cart(gymnasium.Env):
         return np.array([self.distance, self.speed], np.float32)
 
 
-def main(steps: int = 6_000, agent: str = "sac-lstm", out: str = "runs/cart") -> None:
+def main(quick: bool = False) -> None:
     """Train without the speed. The environment never ends an episode, so this sets a time limit of 60 steps."""
     task = beliefrl.GymnasiumTask(Cart, indices=(0,), max_steps=60)
-    run = beliefrl.train(agent, task, out, steps=steps, eval_every=1_000)
+    if quick:
+        small = {"d_size": 32, "seq_len": 16, "burn_in": 16, "policy_layers": (32,), "value_layers": (32,)}
+        agent = beliefrl.make_agent("sac-lstm", step_start_rl=300, pretrain_updates=0, **small)
+        run = beliefrl.train(agent, task, "runs/cart-quick", resume=True, steps=600, eval_every=300)
+    else:
+        run = beliefrl.train("sac-lstm", task, "runs/cart", resume=True, steps=6_000, eval_every=1_000)
 
     for row in run.rows(seed=0, kind="evaluation"):
         print(f"step {row['step']}: return {np.mean(row['mode']):.1f}")

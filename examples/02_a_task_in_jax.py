@@ -1,11 +1,12 @@
 """A task in pure JAX. It is compiled together with the agent, so that many seeds train in one program.
 
     pip install beliefrl
-    python examples/02_a_task_in_jax.py                  # 4,000 steps, two seeds
-    python examples/02_a_task_in_jax.py --steps 300      # a short test run
+    python examples/02_a_task_in_jax.py             # 6,000 steps
+    python examples/02_a_task_in_jax.py --quick     # 1,000 steps, enough to see the difference: QUICK
 
 The first observation of an episode shows whether a lamp is on the left or on the right. After some steps in the dark,
-the agent must point to it. Without memory the best return is 0; with memory it is close to 1.
+the agent must point to it. Without memory the best return is 0, with memory it is 1. The agents are small ones: an LSTM
+of 32 numbers is enough to remember a side. Each start makes new folders.
 """
 
 import dataclasses
@@ -47,12 +48,18 @@ class Lamp:
         return jnp.array(False)
 
 
-def main(steps: int = 4_000, seeds: int = 2, agent: str = "sac-lstm", out: str = "runs/lamp") -> None:
-    """Train with memory, `seeds` seeds side by side."""
-    task = Lamp()
-    run = beliefrl.train(agent, task, out, steps=steps, seeds=seeds, eval_every=1_000, eval_episodes=20)
-    results = beliefrl.evaluate(run, episodes=50, task=task)
-    print(f"return per seed: {[round(total, 2) for total in results['mode']['seeds']]}")
+SMALL = {"policy_layers": (64, 64), "value_layers": (64, 64), "step_start_rl": 300, "pretrain_updates": 0}
+FAST = {"lr_actor": 1e-3, "lr_critic": 1e-3}
+MEMORY = {"d_size": 32, "lr_lstm": 1e-3, "seq_len": 14, "burn_in": 7, "batch_size": 16}
+
+
+def main(quick: bool = False) -> None:
+    """Train an agent with memory and one without, two seeds of each side by side."""
+    options = {"steps": 1_000 if quick else 6_000, "seeds": 2, "eval_every": 500, "eval_episodes": 50}
+    memory = beliefrl.train(beliefrl.make_agent("sac-lstm", **SMALL, **FAST, **MEMORY), Lamp(), **options)
+    blind = beliefrl.train(beliefrl.make_agent("sac-mlp", **SMALL, **FAST), Lamp(), **options)
+    for name, run in (("with memory", memory), ("without memory", blind)):
+        print(f"return {name}, per seed: {[round(mean, 2) for mean in run.results()['mode']['seeds']]}")
 
 
 if __name__ == "__main__":

@@ -1,10 +1,11 @@
 """A new agent: soft actor-critic on the last few observations, which determine a hidden velocity.
 
     pip install beliefrl
-    python examples/03_a_new_agent.py                  # 6,000 steps on the pendulum without its speed: a few minutes
-    python examples/03_a_new_agent.py --steps 300      # a short test run
+    python examples/03_a_new_agent.py             # 6,000 steps on the pendulum without its speed: a few minutes
+    python examples/03_a_new_agent.py --quick     # 600 steps, to see it run: QUICK
 
-After 6,000 steps two seeds have returns of -750 and -495. A random policy gets about -1200.
+After 6,000 steps two seeds have returns of -750 and -495. A random policy gets about -1200. A second start continues the
+run in runs/stack.
 
 An agent is a frozen dataclass of hyperparameters whose methods are pure functions, for one seed and one actor. The
 training loop maps them over seeds and environments. `SACAgent` has the hyperparameters of Table 1 of the paper, and the
@@ -91,8 +92,8 @@ class StackAgent(SACAgent):
         """The beliefs at every timestep of the windows, from the same memory as in acting."""
         begins = windows.step.is_first | ~windows.exists
 
-        def perceive(memory, moment):
-            obs, first = moment
+        def perceive(memory, step):
+            obs, first = step
             older = jnp.where(first[:, None, None], jnp.broadcast_to(obs[:, None], memory.shape), memory)
             memory = jnp.concatenate([older[:, 1:], obs[:, None]], axis=1)
             return memory, memory.reshape(len(memory), -1)
@@ -119,9 +120,13 @@ class StackAgent(SACAgent):
         return State(controller, optimiser), metrics
 
 
-def main(steps: int = 6_000, seeds: int = 2, out: str = "runs/stack") -> None:
-    """Train on the pendulum whose angle is observed and whose velocity is hidden."""
-    run = beliefrl.train(StackAgent(), "pendulum-p", out, steps=steps, seeds=seeds)
+def main(quick: bool = False) -> None:
+    """Train on the pendulum whose angle is observed and whose velocity is hidden, two seeds side by side."""
+    if quick:
+        agent = StackAgent(step_start_rl=300, pretrain_updates=100)
+        run = beliefrl.train(agent, "pendulum-p", "runs/stack-quick", resume=True, steps=600, seeds=2)
+    else:
+        run = beliefrl.train(StackAgent(), "pendulum-p", "runs/stack", resume=True, steps=6_000, seeds=2)
     for seed in run.seeds:
         means = {row["step"]: round(sum(row["sampled"]) / len(row["sampled"])) for row in run.rows(seed, "evaluation")}
         print(f"seed {seed}: return at each evaluation {means}")

@@ -2,7 +2,8 @@
 
     pip install beliefrl
     beliefrl train vrm gym:Pendulum-v1 --observe 2 --steps 10000 --out runs/pendulum
-    python examples/04_deploying.py runs/pendulum
+    python examples/04_deploying.py runs/pendulum     # any run will do
+    python examples/04_deploying.py --quick           # trains a small agent first: QUICK
 
 Inputs and outputs are numpy arrays. `state` is the recurrent memory: pass it to the next call, or None at the start of
 an episode. The reward of the last step is an input, since the belief depends on it. If a sensor value is not finite,
@@ -19,8 +20,12 @@ import tyro
 import beliefrl
 
 
-def main(run: tyro.conf.Positional[str], episodes: int = 3) -> None:
+def main(run: tyro.conf.Positional[str] = "runs/pendulum", episodes: int = 3, quick: bool = False) -> None:
     """Play in the run's environment; then export the policy, load the file, and compare the first actions."""
+    if quick:
+        agent = beliefrl.make_agent("sac-lstm", step_start_rl=200, pretrain_updates=0, d_size=32, policy_layers=(32,))
+        run, task = "runs/pendulum-quick", beliefrl.make_task("gym:Pendulum-v1", observe=2)
+        beliefrl.train(agent, task, run, resume=True, steps=300)
     policy = beliefrl.load(run)
     print(policy)  # shows agent, task, sizes, seed
     task = beliefrl.task_of(run)

@@ -1,8 +1,8 @@
 """Train another library's agent on a BeliefRL task: RecurrentPPO of sb3-contrib, on the pendulum with only its speed.
 
     pip install beliefrl sb3-contrib
-    python examples/05_train_elsewhere.py               # 5,000 steps: a short test run
-    python examples/05_train_elsewhere.py --steps 500000
+    python examples/05_train_elsewhere.py             # 500,000 steps
+    python examples/05_train_elsewhere.py --quick     # 2,048 steps, to see it run
 
 The return of an episode is about -1200 for a random policy, and -150 if the pendulum is swung up and held.
 """
@@ -19,19 +19,19 @@ import beliefrl  # noqa: F401 - registers BeliefRL/... in Gymnasium
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="RecurrentPPO on BeliefRL/PendulumV-v0")
-    parser.add_argument("--steps", type=int, default=5_000, help="environment steps to train")
-    parser.add_argument("--episodes", type=int, default=20, help="episodes to evaluate")
+    parser.add_argument("--quick", action="store_true", help="train for 2,048 steps, and evaluate two episodes")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
+    steps, episodes = (2_048, 2) if args.quick else (500_000, 20)
 
     environments = make_vec_env("BeliefRL/PendulumV-v0", n_envs=8, seed=args.seed)
     settings = {"learning_rate": 1e-3, "gamma": 0.9, "n_steps": 128, "batch_size": 512}
     agent = RecurrentPPO("MlpLstmPolicy", environments, **settings, seed=args.seed)
-    agent.learn(args.steps)
+    agent.learn(steps)
 
     fresh = gymnasium.make("BeliefRL/PendulumV-v0")
     fresh.reset(seed=args.seed + 1)  # episodes that differ from those of the training
-    mean, deviation = evaluate_policy(agent, fresh, n_eval_episodes=args.episodes, warn=False)
+    mean, deviation = evaluate_policy(agent, fresh, n_eval_episodes=episodes, warn=False)
     print(f"Return after {agent.num_timesteps} steps: {mean:.1f}, standard deviation over episodes {deviation:.1f}")
 
 

@@ -4,7 +4,6 @@ import pytest
 
 from beliefrl import cli
 from beliefrl.sweeps import run
-from beliefrl.sweeps.run import SweepStatus
 from written import a_run, flat
 
 
@@ -13,9 +12,8 @@ def asked(monkeypatch, tmp_path):
     """The arguments of `sweep`, which is replaced and runs nothing."""
     given = []
 
-    def sweep(experiments, folder, report, **options):
+    def sweep(experiments, folder, **options):
         given.append((experiments, folder, options))
-        report(SweepStatus([], []))
 
     monkeypatch.setattr(run, "sweep", sweep)
     monkeypatch.chdir(tmp_path)

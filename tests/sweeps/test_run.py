@@ -84,6 +84,18 @@ def test_what_is_finished_is_not_done_again(tmp_path):
     assert Pretence.started == ["vrm-pendulum-seed2", "vrm-cartpole-seed2"]
 
 
+def test_a_sweep_shows_its_trainings_unless_it_is_asked_not_to(tmp_path, capsys):
+    sweep(TWO, tmp_path / "shown", workers=3)
+    lines = capsys.readouterr().out.splitlines()
+    assert "4 trainings, " in lines[0]
+    assert any("finished: vrm-" in line for line in lines)
+    assert f"4 of 4 trainings finished in {tmp_path / 'shown'}" in lines[-1]
+    seen = []
+    sweep(TWO, tmp_path / "silent", progress=False, report=seen.append)
+    assert capsys.readouterr() == ("", "")
+    assert len(seen[-1].finished) == 4
+
+
 def test_a_sweep_can_be_made_longer(tmp_path):
     sweep(TWO, tmp_path)
     Pretence.started.clear()

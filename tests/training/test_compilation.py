@@ -21,7 +21,7 @@ small = {"train_times_fivrm": 2, "d_size": 8, "z_size": 4, "hidden_size": 8, "se
 agent = make_agent("vrm", batch_size=2, step_start_rl=20, policy_layers=(8,), value_layers=(8,), **small)
 notes = []
 run = train(agent, "pendulum-v", sys.argv[1], lambda event: notes.append(event.note), steps=30, eval_every=30,
-            eval_episodes=1)
+            eval_episodes=1, progress=False)
 saved = run.folder.rglob("*.safetensors")
 digest = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(saved))).hexdigest()
 print(json.dumps([digest, run.results()["sampled"], [note for note in notes if note]]))

@@ -15,8 +15,7 @@ from beliefrl import agents, cli, evaluate, load, tasks, train
 from beliefrl.runs.run import Run
 from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
 from beliefrl.tasks.pendulum import Pendulum, PendulumState
-from beliefrl.training import host_loop, lockstep, phases
-from beliefrl.training import train as training
+from beliefrl.training import host_loop, lockstep, phases, session
 from beliefrl.training.lockstep import Lockstep
 from beliefrl.types import UserError
 from small import MODELS, SEQUENCES, SHARED, leaves, trained
@@ -188,7 +187,7 @@ def test_the_command_line_has_a_process_of_its_own(monkeypatch, tmp_path):
         self.recorder.close()
         raise UserError("That is enough.")
 
-    monkeypatch.setattr(training._Training, "run", run)
+    monkeypatch.setattr(session.Session, "run", run)
     for line in ("train sac-mlp pendulum-v --out", "resume"):
         with pytest.raises(SystemExit):
             cli.main([*line.split(), str(tmp_path / "run")])

@@ -155,6 +155,20 @@ def test_every_agent_goes_on_to_the_last_bit(tmp_path, name):
     assert files(tmp_path / "run") == files(tmp_path / "whole")
 
 
+def test_train_goes_on_where_it_is_asked_to(whole, tmp_path):
+    folder = tmp_path / "run"
+    with pytest.raises(Crash):
+        train(AGENT, "pendulum-v", folder, crash_at(whole[1] - 4), resume=True, **OPTIONS)
+    with pytest.raises(UserError, match=r"exists already: .* in Python out= or resume=True\."):
+        train(AGENT, "pendulum-v", folder, **OPTIONS)
+    with pytest.raises(UserError, match=r"was trained with seeds=2, not 3: choose another --out, in Python out=\."):
+        train(AGENT, "pendulum-v", folder, resume=True, **OPTIONS | {"seeds": 3})
+    for _ in range(2):
+        run = train(AGENT, "pendulum-v", folder, resume=True, **OPTIONS)
+        assert files(folder) == files(whole[0])
+    assert len(run.config["resumed"]) == 2
+
+
 @pytest.mark.slow
 def test_a_finished_training_can_be_made_longer(whole, tmp_path):
     folder, _ = whole

@@ -1,9 +1,11 @@
-"""A second Ctrl-C is heard while a compiled function runs."""
+"""What signals do: the first stops a training, the second ends the program, and nobody sees a traceback of ours."""
 
 import signal
 import subprocess
 import sys
 import time
+
+import pytest
 
 SLEEPER = """
 import hashlib
@@ -60,3 +62,111 @@ def test_signals_that_come_together_are_one_request():
             assert process.wait(timeout=20) == 143
         finally:
             process.kill()
+
+
+TRAINING = """
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
+import beliefrl
+
+def train():
+    agent = beliefrl.make_agent("sac-mlp", step_start_rl=400_000, policy_layers=(8,), value_layers=(8,))
+    beliefrl.train(agent, "pendulum", "run", steps=400_000)
+"""
+
+
+def stopped(folder, script, number):
+    """Exit code, output and errors of a script, of which a training gets a signal while it explores."""
+    command = [sys.executable, "-u", "-c", TRAINING + script]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, cwd=folder, text=True, **pipes) as process:
+        try:
+            for line in process.stdout:
+                if line.endswith(" exploring\n"):
+                    break
+            process.send_signal(number)
+            out, err = process.communicate(timeout=300)
+        finally:
+            process.kill()
+    return process.returncode, out, err
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_script_ends_with_one_sentence_and_the_exit_code_of_the_command_line(tmp_path, number, code):
+    ended, _, err = stopped(tmp_path, "train()", number)
+    assert ended == code
+    assert err.startswith("beliefrl: stopped at step ")
+    assert "`beliefrl resume run` goes on from there, in Python beliefrl.resume('run')." in err
+    assert err.count("\n") == 1
+
+
+STOPPED = """
+import os, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from beliefrl.training.stop import Requests, Stopped
+assert sys.excepthook is sys.__excepthook__  # an import changes nothing
+
+def train():
+    with Requests() as requests:
+        os.kill(os.getpid(), signal.SIGINT)
+        raise Stopped("stopped at step 3.", requests.number)
+"""
+
+
+def python(script, *options, typed=""):
+    """A Python process that ran a script, with `typed` as its input."""
+    command = [sys.executable, *options, "-c", STOPPED + script]
+    return subprocess.run(command, input=typed, capture_output=True, text=True, timeout=300)
+
+
+def test_a_program_may_catch_it_and_other_errors_keep_their_traceback():
+    done = python("try:\n    train()\nexcept KeyboardInterrupt as error:\n    print(error.exit_code)\n1 / 0")
+    assert (done.returncode, done.stdout) == (1, "130\n")
+    assert "Traceback" in done.stderr
+    assert "ZeroDivisionError" in done.stderr
+
+
+def test_an_excepthook_of_the_program_still_gets_the_other_errors():
+    done = python("sys.excepthook = lambda kind, *_: print(kind)\ntry:\n    train()\nexcept Stopped:\n    1 / 0")
+    assert done.stdout == "<class 'ZeroDivisionError'>\n"
+    done = python("sys.excepthook = lambda kind, *_: print(kind)\ntrain()")
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "beliefrl: stopped at step 3.\n")
+
+
+def test_an_interactive_session_returns_to_the_prompt():
+    done = python("", "-i", typed="train()\nprint('here', 6 * 7)\n")
+    assert done.returncode == 0
+    assert "here 42" in done.stdout
+    assert "beliefrl: stopped at step 3." in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+TWICE = """
+import time
+with Requests() as requests:
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(0.5)
+    os.kill(os.getpid(), signal.SIGINT)
+"""
+
+
+def test_a_second_interrupt_does_not_end_an_interactive_session():
+    done = python(TWICE, "-i", typed="print('here', 6 * 7)\n")
+    assert (done.returncode, "here 42" in done.stdout) == (0, True)
+    assert "beliefrl: stopped at once" in done.stderr
+
+
+def test_a_notebook_shows_the_sentence():
+    from beliefrl.training.stop import Stopped
+
+    shell = pytest.importorskip("IPython.core.interactiveshell").InteractiveShell()
+    try:
+        script = "from beliefrl.training.stop import Stopped\nraise Stopped('stopped at step 3.', 2)"
+        with pytest.MonkeyPatch.context() as patch:
+            shown = []
+            patch.setattr(shell, "_showtraceback", lambda kind, error, lines: shown.extend(lines))
+            result = shell.run_cell(script)
+        assert isinstance(result.error_in_exec, Stopped)
+        assert shown == ["beliefrl: stopped at step 3."]
+    finally:
+        shell.history_manager.end_session()

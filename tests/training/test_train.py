@@ -143,8 +143,9 @@ def test_python_gives_the_metrics_of_the_command_line(trained, tmp_path):
     script = f"""
 import beliefrl
 agent = beliefrl.make_agent("vrm", **{SMALL})
-run = beliefrl.train(agent, beliefrl.make_task("pendulum-v"), out={str(tmp_path / "run")!r}, **{OPTIONS})
-assert beliefrl.evaluate(run, episodes=1)["episodes"] == 1
+task, out = beliefrl.make_task("pendulum-v"), {str(tmp_path / "run")!r}
+run = beliefrl.train(agent, task, out, progress=False, **{OPTIONS})
+assert beliefrl.evaluate(run, episodes=1, progress=False)["episodes"] == 1
 """
     assert output(sys.executable, "-c", script) == ""
     for seed in range(2):

@@ -53,8 +53,9 @@ def show(argv: Sequence[str]) -> None:
     from rich.console import Console
 
     from beliefrl.agents import is_own
-    from beliefrl.commands.display import results_table, run_table
+    from beliefrl.commands.tables import run_table
     from beliefrl.runs.run import Run
+    from beliefrl.training.display import results_table
     from beliefrl.training.evaluation import agent_of
 
     run, console = Run(options.run), Console()
@@ -72,12 +73,12 @@ def evaluate(argv: Sequence[str]) -> None:
     options = parse(EvaluateOptions, argv, "beliefrl evaluate")
     from rich.console import Console
 
-    from beliefrl.commands.display import results_table
     from beliefrl.runs.run import Run
+    from beliefrl.training.display import results_table
     from beliefrl.training.evaluation import evaluate as play
 
     run = Run(options.run)
-    results = play(run, options.episodes, options.seed, agent=own_agent(options.agent))
+    results = play(run, options.episodes, options.seed, agent=own_agent(options.agent), progress=not options.json)
     if options.json:
         print(json.dumps(results))
         return

@@ -54,23 +54,18 @@ class SweepOptions:
 def sweep(argv: Sequence[str]) -> None:
     """`beliefrl sweep ...`."""
     options = parse(SweepOptions, argv, "beliefrl sweep")
-    from rich.console import Console
-
-    from beliefrl.commands.display import SweepDisplay
     from beliefrl.sweeps.run import sweep as run_sweep
 
     experiments = _experiments(options)
     folder = options.out or pathlib.Path("runs") / ("sweep" + (f"-{options.preset}" if options.preset else ""))
     alone = options.preset == "scalability" and options.workers is None
-    with SweepDisplay(Console(), folder) as display:
-        run_sweep(
-            experiments,
-            folder,
-            workers=0 if alone else options.workers,
-            seeds_per_run=options.seeds_per_run,
-            ray=options.ray,
-            report=display,
-        )
+    run_sweep(
+        experiments,
+        folder,
+        workers=0 if alone else options.workers,
+        seeds_per_run=options.seeds_per_run,
+        ray=options.ray,
+    )
 
 
 def _experiments(options: SweepOptions) -> list:

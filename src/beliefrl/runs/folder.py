@@ -45,8 +45,8 @@ def clear(folder: pathlib.Path) -> None:
     inside = [path.relative_to(folder).as_posix() for path in folder.rglob("*")]
     is_run = _is_of_training(folder)
     if not all(re.fullmatch(UNSAVED if is_run else MAKING, name) for name in inside):
-        hint = f", or `beliefrl resume {folder}`" if is_run else ""
-        raise UserError(f"{folder} exists already: choose another --out{hint}.")
+        go_on, in_python = (f", or `beliefrl resume {folder}`", " or resume=True") if is_run else ("", "")
+        raise UserError(f"{folder} exists already: choose another --out{go_on}; in Python out={in_python}.")
     if not inside:
         return
     with locked(folder, "is being trained"):

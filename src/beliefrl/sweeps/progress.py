@@ -1,5 +1,6 @@
-"""The progress of a sweep's trainings, read from the ends of their logs, and an estimate of the time left."""
+"""The state of a sweep, the progress of its trainings, read from the ends of their logs, and the time left."""
 
+import dataclasses
 import pathlib
 import statistics
 import time
@@ -7,7 +8,6 @@ from typing import NamedTuple
 
 from beliefrl.runs.run import Run
 from beliefrl.sweeps.plan import Training
-from beliefrl.sweeps.run import SweepStatus
 from beliefrl.types import UserError
 
 
@@ -16,6 +16,20 @@ class Pace(NamedTuple):
 
     before: float  # seconds before learning begins: start, compilation, exploration, pre-training
     per_step: float  # seconds per environment step of all its seeds, while it learns
+
+
+@dataclasses.dataclass
+class SweepStatus:
+    """The state of a sweep: each training is finished, waiting, running or failed."""
+
+    finished: list[Training]
+    waiting: list[Training]
+    running: dict[str, Training] = dataclasses.field(default_factory=dict)
+    failed: dict[str, str] = dataclasses.field(default_factory=dict)  # name: the last error message of the training
+
+    @property
+    def count(self) -> int:
+        return len(self.finished) + len(self.waiting) + len(self.running) + len(self.failed)
 
 
 class SweepProgress:

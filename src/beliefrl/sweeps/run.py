@@ -1,10 +1,10 @@
 """The loop of a sweep: start waiting trainings, collect finished ones, and continue after a stop."""
 
-import dataclasses
+import contextlib
 import os
 import pathlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 from beliefrl import agents
@@ -12,6 +12,7 @@ from beliefrl.runs.folder import locked
 from beliefrl.sweeps import cluster, files, local
 from beliefrl.sweeps import plan as plans
 from beliefrl.sweeps.plan import Experiment, Training
+from beliefrl.sweeps.progress import SweepStatus
 from beliefrl.training.stop import Requests, Stopped
 from beliefrl.types import UserError, one_line
 
@@ -30,21 +31,7 @@ class Launcher(Protocol):
     def stop(self) -> None: ...
 
 
-@dataclasses.dataclass
-class SweepStatus:
-    """The state of a sweep: each training is finished, waiting, running or failed."""
-
-    finished: list[Training]
-    waiting: list[Training]
-    running: dict[str, Training] = dataclasses.field(default_factory=dict)
-    failed: dict[str, str] = dataclasses.field(default_factory=dict)  # name: the last error message of the training
-
-    @property
-    def count(self) -> int:
-        return len(self.finished) + len(self.waiting) + len(self.running) + len(self.failed)
-
-
-Report = Callable[[SweepStatus], None]
+Report = Callable[[SweepStatus], Any]
 
 
 def sweep(
@@ -54,6 +41,7 @@ def sweep(
     seeds_per_run: int | None = None,
     ray: str | None = None,
     report: Report | None = None,
+    progress: bool = True,
 ) -> SweepStatus:
     """Run all trainings of some experiments, several at a time. If one fails, the others continue.
 
@@ -65,6 +53,7 @@ def sweep(
         seeds_per_run: most seeds side by side in one program. None: all on a GPU, the fastest number on a CPU.
         ray: address of the head of a Ray cluster (HOST:PORT, or "auto"). None: run on this machine.
         report: called twice a second with the state of the sweep.
+        progress: show what runs, what is left and when it ends: live in a terminal or a notebook, elsewhere as lines.
 
     Raises:
         UserError: a name, setting or value is impossible (raised before any training starts); another process runs this
@@ -81,9 +70,9 @@ def sweep(
         on_gpu = launcher.has_gpus if isinstance(launcher, cluster.Cluster) else slots[0].startswith("gpu")
         together = seeds_per_run or (ALL if on_gpu else None)
         status = _status(folder, plans.extended(before, experiments, together))
-        with Requests() as requests:
+        with _reporting(folder, report, progress) as listen, Requests() as requests:
             try:
-                _loop(folder, status, launcher, report or (lambda status: None), requests)
+                _loop(folder, status, launcher, listen, requests)
             finally:
                 launcher.stop()
     if status.failed:
@@ -93,6 +82,19 @@ def sweep(
             f"cause and run the command again; {folder}/logs has the output of each."
         )
     return status
+
+
+@contextlib.contextmanager
+def _reporting(folder: pathlib.Path, report: Report | None, progress: bool) -> Iterator[Report]:
+    """What is called with every state of the sweep: the display, unless `progress` is False, and `report`."""
+    with contextlib.ExitStack() as stack:
+        listeners = [] if report is None else [report]
+        if progress:
+            from beliefrl.sweeps.display import SweepDisplay
+            from beliefrl.training.screen import screen
+
+            listeners.insert(0, stack.enter_context(SweepDisplay(screen(), folder)))
+        yield lambda status: [listen(status) for listen in listeners]
 
 
 def _check_named(folder: pathlib.Path, before: Sequence[Training], experiments: Sequence[Experiment]) -> None:

@@ -2,7 +2,7 @@
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -143,6 +143,7 @@ def evaluate(
     seed: int = 0,
     task: Task | GymnasiumTask | None = None,
     agent: Agent | type | None = None,
+    progress: bool = True,
 ) -> dict[str, Any]:
     """Let the trained agents of a run play `episodes` new episodes, once with sampled and once with mode actions.
 
@@ -152,6 +153,8 @@ def evaluate(
         seed: of these episodes: the same seed gives the same numbers.
         task: needed only where the run was trained on a task of your own.
         agent: needed only where an agent of your own was trained: its class, or one of them.
+        progress: show that episodes are played, while they are: live in a terminal or a notebook; elsewhere a line
+            after three seconds, and then once a minute.
 
     Returns:
         {"episodes", "sampled": {"mean", "sem", "seeds", "success", "seeds_success"}, "mode": the same}. Returns are
@@ -168,20 +171,35 @@ def evaluate(
     trained, found, states, precision = restore(run, task, agent)
     keep_compiled()
     keys = jax.random.split(jax.random.key(seed), len(run.seeds))
-    with jax.default_matmul_precision(precision):
+    with _showing(progress, 2 * episodes * len(run.seeds)) as ended, jax.default_matmul_precision(precision):
         if isinstance(found, GymnasiumTask):
-            result = _on_host(trained, found, states, keys, episodes, run.seeds)
+            result = _on_host(trained, found, states, keys, episodes, run.seeds, ended)
         else:
             compiled = jax.jit(jax.vmap(lambda state, key: evaluate_seed(trained, found, state, key, episodes)))
-            result = compiled(states, keys)
+            result = jax.block_until_ready(compiled(states, keys))
     return {"episodes": episodes} | summary(result, found.spec.has_success)
 
 
+def _showing(progress: bool, episodes: int) -> contextlib.AbstractContextManager[Callable[[int], None]]:
+    """Gives a function to call with the number of episodes that have ended; with `progress` they are shown."""
+    if not progress:
+        return contextlib.nullcontext(lambda count: None)
+    from beliefrl.training.screen import playing
+
+    return playing(episodes)
+
+
 def _on_host(
-    agent: Agent, task: GymnasiumTask, states: Any, keys: Key[Array, " seed"], episodes: int, seeds: list[int]
+    agent: Agent,
+    task: GymnasiumTask,
+    states: Any,
+    keys: Key[Array, " seed"],
+    episodes: int,
+    seeds: list[int],
+    ended: Callable[[int], None],
 ) -> Episode:
     evaluation = Evaluation(agent, task, seeds, "never")
     try:
-        return evaluation.play(states, keys, episodes)
+        return evaluation.play(states, keys, episodes, ended)
     finally:
         evaluation.close()

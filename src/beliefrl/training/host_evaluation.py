@@ -33,8 +33,14 @@ class Evaluation:
         lanes = jax.vmap(partial(_perceive, agent, task.spec), in_axes=(None, 0, 0, 0, 0, None))
         self._perceive = jax.jit(jax.vmap(lanes, in_axes=(0, 0, 0, 0, None, None)))
 
-    def play(self, states: Any, keys: Key[Array, " seed"], episodes: int) -> Episode:
-        """`episodes` episodes, one after the other; leaves (seed, 2, episodes)."""
+    def play(
+        self,
+        states: Any,
+        keys: Key[Array, " seed"],
+        episodes: int,
+        ended: Callable[[int], None] = lambda count: None,
+    ) -> Episode:
+        """`episodes` episodes, one after the other; leaves (seed, 2, episodes). `ended` is called with their count."""
         if self.environments is None:
             lanes = [f"evaluation of seed {seed}" for seed in self.seeds for _ in range(2)]
             self.environments = Lockstep(self.task, lanes, self.processes, self.notify)
@@ -58,6 +64,7 @@ class Evaluation:
             if done.any():
                 obs = self.environments.restart(done)
                 returns, length = np.where(done, 0.0, returns), np.where(done, 0, length)
+                ended(int(record.episodes.done.sum()))
             step = Timestep(obs, reward * ~done, action * ~done[:, None], done, never)
         return jax.tree.map(lambda leaf: leaf.reshape(*keys.shape, episodes), record.episodes)
 

@@ -1,13 +1,17 @@
-"""Ctrl-C and SIGTERM: the first asks a training to stop, the second ends the program at once."""
+"""Ctrl-C and SIGTERM: the first asks a training to stop, the second ends the program at once.
+
+A program that leaves `Stopped` uncaught ends with its sentence and its exit code, and shows no traceback.
+"""
 
 import contextlib
 import os
 import signal
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable
-from types import FrameType
+from types import FrameType, TracebackType
 from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -15,15 +19,26 @@ ONE_REQUEST = 0.3  # seconds in which several signals count as one: a parent tha
 
 
 class Stopped(KeyboardInterrupt):
-    """A training was stopped by a signal; its message says how to go on."""
+    """A training was stopped by a signal; its message says how to go on.
+
+    Uncaught, it ends a script with that sentence and `exit_code`: 130 for Ctrl-C, 143 for SIGTERM. In an interactive
+    session or a notebook the sentence is shown, and the session goes on.
+    """
 
     def __init__(self, message: str, number: int):
         super().__init__(message)
         self.exit_code = 128 + number
 
+    def _render_traceback_(self) -> list[str]:
+        """What IPython shows in place of a traceback."""
+        return [f"beliefrl: {self}"]
+
 
 class Requests:
     """While entered, the first signal is kept in `number`; a later one ends the program at once.
+
+    In an interactive session a later one raises Stopped, as soon as a compiled function returns: the session's
+    variables are not lost. A Stopped that leaves is shown without a traceback if nobody catches it.
 
     Python runs handlers between two of its own instructions, so a signal during a compiled function waits until that
     returns. The system therefore also writes each signal to a socket at once. A thread reads it: it confirms the first
@@ -48,7 +63,9 @@ class Requests:
             self._before[number] = signal.signal(number, self._handle)
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not None and issubclass(kind, Stopped):
+            _show_without_traceback()
         if not self._before:
             return
         for number, handler in self._before.items():
@@ -59,7 +76,9 @@ class Requests:
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self.number is None:
-            self.number = number
+            self.number, self._heard = number, time.monotonic()
+        elif is_interactive() and time.monotonic() - self._heard > ONE_REQUEST:
+            raise Stopped("stopped at once; what was logged and saved stays in the run's folder.", number)
 
     def _watch(self, ours: socket.socket) -> None:
         first = None
@@ -71,5 +90,27 @@ class Requests:
                         first = now
                         with contextlib.suppress(Exception):  # an error of `confirm` must not stop the thread
                             self._confirm()
-                    elif now - first > ONE_REQUEST:
+                    elif now - first > ONE_REQUEST and not is_interactive():
                         os._exit(128 + received[0])
+
+
+def is_interactive() -> bool:
+    """Whether someone types at a prompt: Python's, IPython's, or a notebook."""
+    return hasattr(sys, "ps1") or bool(sys.flags.interactive)
+
+
+def _show_without_traceback() -> None:
+    """From now on an uncaught Stopped is a sentence and an exit code. Python has no other place to say so than its
+    hook for uncaught exceptions; it gets all others as before.
+    """
+    before = sys.excepthook
+
+    def show(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+        if not isinstance(error, Stopped):
+            before(kind, error, trace)
+            return
+        print(f"beliefrl: {error}", file=sys.stderr)
+        if not is_interactive():
+            raise SystemExit(error.exit_code)
+
+    sys.excepthook = show

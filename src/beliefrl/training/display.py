@@ -1,0 +1,135 @@
+"""What is shown of a training while it runs and when it ends."""
+
+import io
+import time
+from typing import Any
+
+import numpy as np
+from rich.progress import BarColumn, Progress, TextColumn
+from rich.table import Table
+
+from beliefrl.analysis.curves import curve_figure
+from beliefrl.runs.run import Run
+from beliefrl.training.evaluation import as_argument
+from beliefrl.training.schedule import Event, Phase
+from beliefrl.training.screen import Screen, duration
+from beliefrl.types import UserError
+
+
+class TrainingDisplay:
+    """A live bar with the phase, steps/s, time left and the last returns; a line for every evaluation.
+
+    Where nothing is live there is also a line for every phase. A notebook shows the learning curve as well.
+    """
+
+    def __init__(self, screen: Screen, run: Run):
+        """`run` is the one that is trained."""
+        self.screen, self.run, self.steps = screen, run, run.options.steps
+        self.progress = Progress(
+            TextColumn("{task.description:<26}"), BarColumn(), TextColumn("{task.fields[status]}"), auto_refresh=False
+        )
+        self.bar = self.progress.add_task(Phase.STARTING, total=self.steps, status="")
+        self.returns = ""
+        self.phase = Phase.STARTING
+        self.phase_began = time.monotonic()
+        self.phase_step = 0
+
+    def __enter__(self) -> "TrainingDisplay":
+        self.screen.__enter__()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self.screen.__exit__()
+        if kind is None:
+            self._ended()
+
+    def __call__(self, event: Event) -> None:
+        """Show an event."""
+        now = time.monotonic()
+        if event.note is not None:
+            self.screen.line(event.note)
+            return
+        if event.phase not in (Phase.EVALUATING, self.phase):
+            self._begin_phase(event, now)
+        if event.episodes is not None and np.any(event.episodes.done):
+            ended = np.asarray(event.episodes.episode_return)[np.asarray(event.episodes.done)]
+            self.returns = f"last returns {ended.mean():.1f}"
+        if event.part:
+            done, of = event.part
+            left = (now - self.phase_began) / done * (of - done)
+            self._status(event, done, of, f"{done:,}/{of:,} updates, {duration(left)} left in this phase")
+        else:
+            status = f"step {event.step:,}/{self.steps:,}  {self._speed(event, now)}  {self.returns}"
+            self._status(event, event.step, self.steps, status)
+        if event.evaluation is not None:
+            self._evaluated(event)
+
+    def _begin_phase(self, event: Event, now: float) -> None:
+        """Begin to time a phase, and print its name where nothing is live."""
+        self.phase, self.phase_began, self.phase_step = event.phase, now, event.step
+        if not self.screen.is_live:
+            self.screen.line(event.phase)
+
+    def _status(self, event: Event, done: int, of: int, status: str) -> None:
+        self.progress.update(self.bar, completed=done, total=of, description=event.phase, status=status)
+        text = f"still {event.phase}" if event.phase.is_compiling else f"{event.phase}: {status}"
+        self.screen.status(" ".join(text.split()), self.progress)
+
+    def _speed(self, event: Event, now: float) -> str:
+        steps = event.step - self.phase_step
+        if steps <= 0:
+            return "(a minute at most)" if event.phase.is_compiling else ""
+        rate = steps / (now - self.phase_began)
+        return f"{rate:.0f} steps/s, {duration((self.steps - event.step) / rate)} left"
+
+    def _evaluated(self, event: Event) -> None:
+        result = event.evaluation
+        assert result is not None
+        returns, success = np.asarray(result.episode_return), np.asarray(result.success)
+        sampled, mode = np.nanmean(returns, axis=(0, 2))  # diverged seeds are NaN
+        line = f"step {event.step:,}: return {sampled:.1f} sampled, {mode:.1f} mode"
+        if success.any():
+            line += f"; success {success[:, 0].mean():.0%} sampled, {success[:, 1].mean():.0%} mode"
+        self.screen.line(line)
+        self.screen.picture(self._curve)
+
+    def _curve(self) -> bytes | None:
+        """The learning curve so far, as PNG; None before every seed has an evaluation."""
+        png = io.BytesIO()
+        try:
+            curve_figure(self.run).savefig(png, format="png", dpi=90)
+        except UserError:
+            return None
+        return png.getvalue()
+
+    def _ended(self) -> None:
+        """Show the results of a finished training, and its folder."""
+        run, results = self.run, self.run.results() or {}
+        title = f"{run.config['agent']} on {run.config['task']} after {results['step']:,} steps"
+        self.screen.show(results_table(results, run.seeds, title))
+        command = f"`beliefrl evaluate {as_argument(run)}`"
+        self.screen.show(f"saved in {run.folder}: see curve.png; {command} plays more episodes")
+
+
+def results_table(results: dict[str, Any], seeds: list[int], title: str) -> Table:
+    """Returns of every seed, and over seeds mean and standard error, with sampled and with mode actions."""
+    table = Table(title=title, title_justify="left")
+    with_success = results["sampled"]["success"] is not None
+    for heading in ("seed", "sampled actions", "mode actions", *(["success sampled", "success mode"] * with_success)):
+        table.add_column(heading, justify="right")
+    for index, seed in enumerate(seeds):
+        returns = [results[mode]["seeds"][index] for mode in ("sampled", "mode")]
+        cells = ["diverged" if mean is None else f"{mean:.1f}" for mean in returns]
+        if with_success:
+            cells += [f"{results[mode]['seeds_success'][index]:.0%}" for mode in ("sampled", "mode")]
+        table.add_row(str(seed), *cells)
+    table.add_section()
+    cells = [_mean(results[mode]) for mode in ("sampled", "mode")]
+    if with_success:
+        cells += [f"{results[mode]['success']:.0%}" for mode in ("sampled", "mode")]
+    table.add_row("mean ± S.E.M.", *cells)
+    return table
+
+
+def _mean(mode: dict[str, Any]) -> str:
+    return f"{mode['mean']:.1f}" + (f" ± {mode['sem']:.1f}" if mode["sem"] is not None else "")

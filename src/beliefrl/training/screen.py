@@ -1,0 +1,158 @@
+"""Where progress is shown: live in a terminal and in a notebook; elsewhere, such as in a log, as lines that stay."""
+
+import base64
+import contextlib
+import io
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from rich.console import Console, RenderableType
+from rich.live import Live
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+SILENCE = 60.0  # seconds after which a log gets a line in any case
+
+
+def duration(seconds: float) -> str:
+    """Seconds as 12 s, 3:04 or 1:02:03."""
+    if seconds < 60:
+        return f"{seconds:.0f} s"
+    minutes, seconds = divmod(int(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
+
+
+class Screen:
+    """Progress in a log: only lines. Where none comes for `SILENCE` seconds, the status is printed as one."""
+
+    is_live = False  # whether a status is visible at once
+
+    def __init__(self, console: Console, patience: float = SILENCE):
+        """`patience`: seconds before the first status is printed."""
+        self.console, self.began = console, time.monotonic()
+        self._status, self._printed = "", self.began + patience - SILENCE
+        self._is_over = threading.Event()
+
+    def __enter__(self) -> "Screen":
+        threading.Thread(target=self._break_silence, daemon=True).start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._is_over.set()
+
+    def line(self, text: str) -> None:
+        """Print a line that stays, with the time since the start."""
+        self._printed = time.monotonic()
+        self.show(self.stamped(text))
+
+    def stamped(self, text: str) -> str:
+        """The text with the time since the start."""
+        return f"[{duration(time.monotonic() - self.began)}] {text}"
+
+    def show(self, what: RenderableType) -> None:
+        """Print something that stays."""
+        self.console.print(what, markup=False, highlight=False, soft_wrap=isinstance(what, str))
+
+    def status(self, text: str, live: RenderableType) -> None:
+        """What happens now; it replaces the status before. `text` goes to a log, `live` to a live screen."""
+        self._status = text
+
+    def picture(self, draw: Callable[[], bytes | None]) -> None:
+        """Where pictures can be shown, draw one (PNG) that replaces the one before; None leaves it."""
+
+    def _break_silence(self) -> None:
+        while not self._is_over.wait(max(self._printed + SILENCE - time.monotonic(), 0.1)):
+            if time.monotonic() - self._printed >= SILENCE:
+                with contextlib.suppress(OSError, ValueError):  # the reader has gone; the training notices it
+                    self.line(self._status)
+
+
+class Terminal(Screen):
+    """Progress in a terminal: the status stays at the bottom."""
+
+    is_live = True
+
+    def __enter__(self) -> "Terminal":
+        self._live = Live("", console=self.console, transient=True)
+        self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._live.stop()
+
+    def status(self, text: str, live: RenderableType) -> None:
+        self._live.update(live)
+
+
+class Notebook(Screen):
+    """Progress in a notebook: a text that is replaced, its last line the status, and a picture under it."""
+
+    is_live = True
+
+    def __enter__(self) -> "Notebook":
+        self._lines, self._shown = "", None
+        self._handles: dict[str, Any] = {}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._update("")
+
+    def show(self, what: RenderableType) -> None:
+        """Add it to the text."""
+        self._lines += self._text(what)
+        self._update("")
+
+    def status(self, text: str, live: RenderableType) -> None:
+        self._update(self._text(live))
+
+    def picture(self, draw: Callable[[], bytes | None]) -> None:
+        png = draw()
+        if png is not None:
+            self._display("picture", {"image/png": base64.b64encode(png).decode(), "text/plain": "<picture>"})
+
+    def _update(self, status: str) -> None:
+        text = (self._lines + status).rstrip()
+        if text != self._shown:
+            self._shown = text
+            self._display("text", {"text/plain": text} if text else {})
+
+    def _text(self, what: RenderableType) -> str:
+        console = Console(file=io.StringIO(), width=100, color_system=None, force_terminal=False, force_jupyter=False)
+        with console.capture() as captured:
+            console.print(what, markup=False, highlight=False, soft_wrap=isinstance(what, str))
+        return "".join(line.rstrip() + "\n" for line in captured.get().splitlines())
+
+    def _display(self, name: str, content: dict[str, Any]) -> None:
+        from IPython.display import display
+
+        if name in self._handles:
+            self._handles[name].update(content, raw=True)
+        else:
+            self._handles[name] = display(content, raw=True, display_id=True)
+
+
+def screen(patience: float = SILENCE) -> Screen:
+    """The screen that this process has. `patience` as in `Screen`."""
+    console = Console()
+    kind = Notebook if console.is_jupyter else Terminal if console.is_terminal else Screen
+    return kind(console, patience)
+
+
+@contextlib.contextmanager
+def playing(episodes: int) -> Iterator[Callable[[int], None]]:
+    """Show that so many episodes are played; what it yields is called with how many have ended."""
+    shown = screen(patience=3.0)
+    columns: Any = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    progress = Progress(*columns, auto_refresh=False)
+    bar = progress.add_task(f"playing {episodes:,} episodes", total=None)
+
+    def ended(count: int) -> None:
+        progress.update(bar, completed=count, total=episodes if count else None)
+        done = f"{count:,} of {episodes:,} episodes are over" if count else f"playing {episodes:,} episodes"
+        shown.status(done, progress)
+
+    with shown:
+        ended(0)
+        yield ended
