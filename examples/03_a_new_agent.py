@@ -4,8 +4,8 @@
     python examples/03_a_new_agent.py             # 6,000 steps on the pendulum without its speed: a few minutes
     python examples/03_a_new_agent.py --quick     # 600 steps, to see it run: QUICK
 
-After 6,000 steps two seeds have returns of -750 and -495. A random policy gets about -1200. A second start continues the
-run in runs/stack.
+After 6,000 steps two seeds have returns of -750 and -495. A random policy gets about -1200. A second start continues
+the run in runs/stack.
 
 An agent is a frozen dataclass of hyperparameters whose methods are pure functions, for one seed and one actor. The
 training loop maps them over seeds and environments. `SACAgent` has the hyperparameters of Table 1 of the paper, and the
