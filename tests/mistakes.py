@@ -219,7 +219,7 @@ MISTAKES = {
     "evaluate list": "list/config.json lacks",
     "evaluate binary": "binary/config.json cannot be read",
     "evaluate crowded": "crowded/config.json cannot be used: seeds=1000000000 is impossible",
-    "evaluate wide": "wide/config.json cannot be used: d_size=1000000000 is impossible",
+    "evaluate wide": "cannot be used: d_size=1000000000 is impossible",
     "evaluate nameless": "has no hyperparameter 'name'",
     "predict crowded": "seeds=1000000000 is impossible",
     "predict wide": "d_size=1000000000 is impossible",

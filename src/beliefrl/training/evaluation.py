@@ -130,11 +130,13 @@ def task_of(run: Run | str | os.PathLike[str]) -> Any:
 
 @contextlib.contextmanager
 def _naming(run: Run) -> Iterator[None]:
-    """Name config.json in a UserError about its content."""
+    """Name config.json in a UserError about its content, and the commit that wrote it: it may be another version's."""
     try:
         yield
     except UserError as error:
-        raise UserError(f"{run.folder / 'config.json'} cannot be used: {error}") from None
+        commit = one_line(str(run.config.get("git_commit") or ""))[:12]
+        origin = f" (trained at commit {commit})" if commit else ""
+        raise UserError(f"{run.folder / 'config.json'}{origin} cannot be used: {error}") from None
 
 
 def evaluate(
