@@ -3,7 +3,7 @@
     pip install beliefrl
     beliefrl train vrm gym:Pendulum-v1 --observe 2 --steps 10000 --out runs/pendulum
     python examples/04_deploying.py runs/pendulum     # any run will do
-    python examples/04_deploying.py --quick           # trains a small agent first: QUICK
+    python examples/04_deploying.py --quick           # trains a small agent first: 30 s of CPU time
 
 Inputs and outputs are numpy arrays. `state` is the recurrent memory: pass it to the next call, or None at the start of
 an episode. The reward of the last step is an input, since the belief depends on it. If a sensor value is not finite,

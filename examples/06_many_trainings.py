@@ -1,7 +1,7 @@
 """Compare agents on several tasks and seeds: run a sweep, and write an interactive report.
 
     python examples/06_many_trainings.py                # 12 seeds in total: 40 minutes on two cores
-    python examples/06_many_trainings.py --quick        # 2 seeds in total, of the agents without memory: QUICK
+    python examples/06_many_trainings.py --quick        # 2 seeds, agents without memory: 67 s of CPU time, on two cores
     python examples/06_many_trainings.py --ray auto     # on a Ray cluster
 
 Ctrl-C stops the sweep. The same command continues it; finished trainings are not repeated.

@@ -145,13 +145,13 @@ def cells(monkeypatch):
 
     module = types.ModuleType("IPython.display")
     module.display = lambda content, raw, display_id: Handle(content)
-    monkeypatch.setitem(sys.modules, "IPython", types.ModuleType("IPython"))
     monkeypatch.setitem(sys.modules, "IPython.display", module)
     return made
 
 
 def test_a_notebook_shows_the_status_the_evaluations_and_the_curve(tmp_path, cells, monkeypatch):
     monkeypatch.setenv("FORCE_COLOR", "1")  # as a notebook's kernel does
+    monkeypatch.setattr(screens, "PACE", 0.0)
     run = a_run(tmp_path / "run", [[(20, [-7.0])]], steps=100)
     display = TrainingDisplay(Notebook(console()), run)
     with display.screen:
@@ -163,6 +163,9 @@ def test_a_notebook_shows_the_status_the_evaluations_and_the_curve(tmp_path, cel
         assert lines[0].endswith("step 40: return -7.0 sampled, -7.0 mode")
         assert "step 60/100" in lines[1]
         assert cells[1]["image/png"].startswith("iVBORw0KGgo")  # base64 of PNG
+        monkeypatch.setattr(screens, "PACE", 60.0)
+        display(Event(Phase.LEARNING, 80))
+        assert "step 60/100" in cells[0]["text/plain"]  # not yet replaced
         display.screen.show(results_table(dict.fromkeys(("sampled", "mode"), FLAT), [0], "title"))
     assert cells[0]["text/plain"].splitlines()[0] == lines[0]
     assert "step 60/100" not in cells[0]["text/plain"]

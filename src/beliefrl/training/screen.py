@@ -13,6 +13,7 @@ from rich.live import Live
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 SILENCE = 60.0  # seconds after which a log gets a line in any case
+PACE = 0.25  # seconds between two statuses in a notebook
 
 
 def duration(seconds: float) -> str:
@@ -92,7 +93,7 @@ class Notebook(Screen):
     is_live = True
 
     def __enter__(self) -> "Notebook":
-        self._lines, self._shown = "", None
+        self._lines, self._shown, self._changed = "", None, 0.0
         self._handles: dict[str, Any] = {}
         return self
 
@@ -105,7 +106,9 @@ class Notebook(Screen):
         self._update("")
 
     def status(self, text: str, live: RenderableType) -> None:
-        self._update(self._text(live))
+        if time.monotonic() - self._changed >= PACE:
+            self._changed = time.monotonic()
+            self._update(self._text(live))
 
     def picture(self, draw: Callable[[], bytes | None]) -> None:
         png = draw()
