@@ -1,3 +1,5 @@
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,9 +27,15 @@ def fill(replay, numbers, firsts, keep):
 
 
 def filled(capacity, firsts, keep=None):
-    firsts = np.asarray(firsts, bool)
-    keep = np.ones(len(firsts), bool) if keep is None else np.asarray(keep)
-    return fill(ring.init(moment(0, False), capacity), jnp.arange(len(firsts)), jnp.asarray(firsts), jnp.asarray(keep))
+    """A ring after these moments; the rest up to 40 is masked, so that one program serves every length."""
+    keep = np.ones(len(firsts), bool) if keep is None else keep
+    firsts, keep = (np.pad(np.asarray(flags, bool), (0, 40 - len(flags))) for flags in (firsts, keep))
+    return fill(empty(capacity), np.arange(40), firsts, keep)
+
+
+@functools.cache
+def empty(capacity):
+    return ring.init(moment(0, False), capacity)
 
 
 sample = jax.jit(ring.sample, static_argnums=(2, 3))
