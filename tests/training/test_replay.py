@@ -81,6 +81,10 @@ def test_a_masked_addition_leaves_the_ring_alone():
     np.testing.assert_array_equal(replay.moments.note[0][: keep.sum()], np.arange(20)[keep])
 
 
+def test_an_addition_is_masked_only_where_asked():
+    assert int(jax.jit(ring.add)(empty(8), moment(1, False)).added) == 1
+
+
 def test_starts_are_uniform():
     shape, count = WindowShape(2, 4), 30
     window = sample(filled(64, np.zeros(count, bool)), jax.random.key(2), 20_000, shape)
