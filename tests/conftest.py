@@ -7,7 +7,10 @@ import tempfile
 # Most of a test's time is compilation. So little is optimised, and what one test has compiled the next ones read, and
 # the programs that they start; a folder for each of pytest's processes, as JAX does not write its files in one piece.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
-os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="beliefrl-compiled-")
+# BELIEFRL_TEST_CACHE names a folder that stays, for tests that run again and again in one process at a time.
+os.environ["JAX_COMPILATION_CACHE_DIR"] = os.environ.get("BELIEFRL_TEST_CACHE") or tempfile.mkdtemp(
+    prefix="beliefrl-compiled-"
+)
 os.environ["BELIEFRL_CACHE"] = "off"  # nothing is written to the user's cache folder
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
 os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
@@ -28,4 +31,5 @@ def unchecked(monkeypatch):
 
 
 def pytest_unconfigure():
-    shutil.rmtree(os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
+    if not os.environ.get("BELIEFRL_TEST_CACHE"):
+        shutil.rmtree(os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)

@@ -1,5 +1,7 @@
 """Random windows for agents to learn from."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +21,7 @@ SMALL = {  # VRM
 }
 
 
+@partial(jax.jit, static_argnums=(1, 2))
 def windows(key, batch, time, is_first=None, exists=None):
     """Random windows of `time` moments that begin at an episode's first, where nothing else is said.
 
@@ -58,12 +61,14 @@ def changed_where_missing(agent, state, window, exists):
         window._replace(exists=exists),
         other._replace(exists=exists),
     )
-    results = []
-    for given in (window._replace(exists=exists), changed):
-        after, batches, metrics = jax.jit(agent.begin_cycle)(state, given, jax.random.key(2))
-        after, more = jax.jit(agent.update)(after, jax.tree.map(lambda leaf: leaf[0], batches), jax.random.key(3))
-        results.append((after, metrics | more))
-    return results
+
+    @jax.jit
+    def learned(window):
+        after, batches, metrics = agent.begin_cycle(state, window, jax.random.key(2))
+        after, more = agent.update(after, jax.tree.map(lambda leaf: leaf[0], batches), jax.random.key(3))
+        return after, metrics | more
+
+    return [learned(given) for given in (window._replace(exists=exists), changed)]
 
 
 def slope(function, at, direction, by=1e-2):
@@ -76,6 +81,10 @@ def slope(function, at, direction, by=1e-2):
 
 def random_like(tree, key):
     """Standard normal numbers in the shape of a tree."""
+    return jax.jit(_random_like)(tree, key)
+
+
+def _random_like(tree, key):
     leaves, structure = jax.tree.flatten(tree)
     keys = jax.random.split(key, len(leaves))
     return structure.unflatten([jax.random.normal(k, leaf.shape) for k, leaf in zip(keys, leaves, strict=True)])

@@ -17,9 +17,13 @@ AGENT = SACMLPAgent(policy_layers=(8, 8), value_layers=(8, 8), batch_size=6)
 STANDARDISED = dataclasses.replace(AGENT, standardise=True)
 
 
+def begun(agent):
+    return jax.jit(lambda key: agent.init(key, SPEC))(jax.random.key(0))
+
+
 @pytest.fixture(scope="module")
 def state():
-    return jax.jit(lambda key: AGENT.init(key, SPEC))(jax.random.key(0))
+    return begun(AGENT)
 
 
 def test_its_transitions_are_those_of_the_golden_update():
@@ -34,7 +38,8 @@ def test_its_transitions_are_those_of_the_golden_update():
         is_first=jnp.zeros((rows, 2), bool).at[:, 0].set(True),
         terminated=jnp.stack([jnp.zeros(rows, bool), numbers["terminated"] > 0], axis=1),
     )
-    batch = AGENT.batch(jax.tree.map(lambda leaf: leaf.swapaxes(0, 1), Window(step, (), jnp.ones((rows, 2), bool))))
+    window = jax.tree.map(lambda leaf: leaf.swapaxes(0, 1), Window(step, (), jnp.ones((rows, 2), bool)))
+    batch = jax.jit(AGENT.batch)(window)
     for name in ("belief", "next_belief", "action", "reward", "terminated"):
         np.testing.assert_array_equal(getattr(batch, name), numbers[name])
     assert batch.valid.all()
@@ -52,26 +57,26 @@ def test_pairs_across_episodes_enter_no_loss(state):
 
 @pytest.mark.parametrize("agent", [AGENT, STANDARDISED])
 def test_pretraining_is_an_update_of_the_controller(agent):
-    window, state = windows(jax.random.key(1), 6, 2), agent.init(jax.random.key(0), SPEC)
+    window, state = windows(jax.random.key(1), 6, 2), begun(agent)
     after, _ = jax.jit(agent.pretrain)(state, window, jax.random.key(2))
-    begun, batches, metrics = jax.jit(agent.begin_cycle)(state, window, jax.random.key(7))
-    again, _ = jax.jit(agent.update)(begun, jax.tree.map(lambda leaf: leaf[0], batches), jax.random.key(2))
+    cycle, batches, metrics = jax.jit(agent.begin_cycle)(state, window, jax.random.key(7))
+    again, _ = jax.jit(agent.update)(cycle, jax.tree.map(lambda leaf: leaf[0], batches), jax.random.key(2))
     assert metrics == {}
     assert differ(after.controller, state.controller)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7), after, again)
 
 
 def test_standardised_it_does_not_matter_in_which_units_observations_are():
-    window, state = windows(jax.random.key(1), 6, 2), STANDARDISED.init(jax.random.key(0), SPEC)
+    window, state = windows(jax.random.key(1), 6, 2), begun(STANDARDISED)
     units = np.array([[[100.0, 20.0, 0.5]]], np.float32)
     others = window._replace(step=window.step._replace(obs=(window.step.obs + 7) * units))
-    actions, learn = [], jax.jit(STANDARDISED.pretrain)
+    actions, learn, act = [], jax.jit(STANDARDISED.pretrain), jax.jit(STANDARDISED.act)
     for each in (window, others):
         after, _ = learn(state, each, jax.random.key(2))
         step = jax.tree.map(lambda leaf: leaf[1, 3], each.step)
-        actions.append(STANDARDISED.act(after, (), step, jax.random.key(3), jnp.array(False))[0])
+        actions.append(act(after, (), step, jax.random.key(3), jnp.array(False))[0])
     np.testing.assert_allclose(*actions, rtol=0.01)  # but for what keeps quiet entries from infinity
-    raw = AGENT.act(after._replace(scale=None), (), step, jax.random.key(3), jnp.array(False))[0]
+    raw = jax.jit(AGENT.act)(after._replace(scale=None), (), step, jax.random.key(3), jnp.array(False))[0]
     assert np.abs(raw - actions[0]).max() > 0.05
 
 

@@ -107,6 +107,7 @@ def test_where_runs_lay_on_this_machine_is_not_kept(tmp_path):
         gzip.compress(b'{"format": 1, "defaults": {}, "runs": [{"name": "a", "config": {}, "rows": {}}]}'),
         gzip.compress(b"{}")[:-9],
     ],
+    ids=["no gzip", "no json", "empty", "no dates", "cut"],  # gzip's content has the time in it: no name of a test
 )
 def test_a_file_of_another_kind_is_told(tmp_path, content):
     (tmp_path / "kept.json.gz").write_bytes(content)

@@ -1,6 +1,7 @@
 """Our networks and losses give the numbers that the authors' code gave (tests/golden, toy sizes, PyTorch's layout)."""
 
 import pathlib
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -27,7 +28,7 @@ def net(numbers, name, activation):
     """The weights `name` of a golden file as an MLP."""
     count = sum(key.startswith(f"{name}/") and key.endswith("weight") for key in numbers)
     sizes = [numbers[f"{name}/0/weight"].shape[1]] + [numbers[f"{name}/{i}/weight"].shape[0] for i in range(count)]
-    mlp = MLP(sizes, activation)
+    mlp = jax.eval_shape(lambda: MLP(sizes, activation))
     layers = tuple(
         eqx.tree_at(
             lambda layer: (layer.weight, layer.bias),
@@ -46,7 +47,7 @@ def with_weights(part, group):
 
 def vrm_from(numbers):
     """A VRM whose weights (or whose gradient) are the golden ones; the two LSTM biases become one."""
-    vrm = VRM(X, ACTION, D, Z, HIDDEN)
+    vrm = jax.eval_shape(lambda: VRM(X, ACTION, D, Z, HIDDEN))
     mean, sigma = net(numbers, "posterior_mean", jnp.tanh), net(numbers, "posterior_sigma", jnp.tanh)
     posterior = np.concatenate([mean.layers[0].weight, sigma.layers[0].weight]).T  # rows d, action, features
     w_ih, w_hh = numbers["lstm/weight_ih"].T, numbers["lstm/weight_hh"].T  # rows features, z
@@ -93,15 +94,22 @@ def inputs(vrm_numbers):
 
 def negative_elbo(vrm, inputs):
     x, action, _, _ = inputs
-    terms = elbo_terms(vrm, vrm.infer(vrm.start(x.shape[1]), *inputs), x, action)
-    return jnp.mean(terms.kl) - jnp.mean(terms.log_likelihood)
+    inferred = vrm.infer(vrm.start(x.shape[1]), *inputs)
+    terms = elbo_terms(vrm, inferred, x, action)
+    return jnp.mean(terms.kl) - jnp.mean(terms.log_likelihood), (inferred, terms)
 
 
-def test_inference_equals_the_authors(vrm_numbers, inputs):
+@pytest.fixture(scope="module")
+def elbo(vrm_numbers, inputs):
+    """The negative ELBO with the unroll and the terms that it comes from, and its gradient."""
     vrm = vrm_from(with_weights(vrm_numbers, "w/"))
-    inferred = vrm.infer(vrm.start(3), *inputs)
-    prior = jax.vmap(jax.vmap(vrm.prior))(inferred.before, inputs[1])
-    decoded = jax.vmap(jax.vmap(vrm.decode))(inferred.before, inferred.z)
+    return jax.jit(jax.value_and_grad(negative_elbo, has_aux=True))(vrm, inputs)
+
+
+def test_inference_equals_the_authors(vrm_numbers, inputs, elbo):
+    vrm, (inferred, _) = vrm_from(with_weights(vrm_numbers, "w/")), elbo[0][1]
+    prior = jax.jit(jax.vmap(jax.vmap(vrm.prior)))(inferred.before, inputs[1])
+    decoded = jax.jit(jax.vmap(jax.vmap(vrm.decode)))(inferred.before, inferred.z)
     ours = {
         "posterior_mean": inferred.posterior.mean,
         "posterior_sigma": inferred.posterior.sigma,
@@ -114,23 +122,21 @@ def test_inference_equals_the_authors(vrm_numbers, inputs):
         "decoded_sigma": decoded.sigma,
     }
     for name, value in ours.items():
-        close(value.swapaxes(0, 1), vrm_numbers[name])
+        close(np.asarray(value).swapaxes(0, 1), vrm_numbers[name])
 
 
-def test_elbo_equals_the_authors(vrm_numbers, inputs):
-    vrm = vrm_from(with_weights(vrm_numbers, "w/"))
-    terms = elbo_terms(vrm, vrm.infer(vrm.start(3), *inputs), inputs[0], inputs[1])
-    close(terms.kl.T, vrm_numbers["kl"])
-    close(terms.log_likelihood.T, vrm_numbers["log_likelihood"])
-    close(negative_elbo(vrm, inputs), vrm_numbers["negative_elbo"])
+def test_elbo_equals_the_authors(vrm_numbers, elbo):
+    value, (_, terms) = elbo[0]
+    close(np.asarray(terms.kl).T, vrm_numbers["kl"])
+    close(np.asarray(terms.log_likelihood).T, vrm_numbers["log_likelihood"])
+    close(value, vrm_numbers["negative_elbo"])
 
 
-def test_gradient_of_the_elbo_equals_the_authors(vrm_numbers, inputs):
-    gradient = jax.grad(negative_elbo)(vrm_from(with_weights(vrm_numbers, "w/")), inputs)
+def test_gradient_of_the_elbo_equals_the_authors(vrm_numbers, elbo):
     numbers = with_weights(vrm_numbers, "g/")
     np.testing.assert_array_equal(numbers["lstm/bias_ih"], numbers["lstm/bias_hh"])
     theirs = vrm_from(numbers | {"lstm/bias_hh": np.zeros_like(numbers["lstm/bias_hh"])})
-    jax.tree.map(close, gradient, theirs)
+    jax.tree.map(close, elbo[1], theirs)
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +145,7 @@ def sac_numbers():
 
 
 def controller_from(numbers, log_alpha):
-    actor = Actor(39, 3, (8, 8))
+    actor = jax.eval_shape(lambda: Actor(39, 3, (8, 8)))
     networks = {name: net(numbers, name, jax.nn.relu) for name in ("mean", "log_sigma", "value", "q1", "q2")}
     actor = eqx.tree_at(lambda actor: (actor.mean, actor.log_sigma), actor, (networks["mean"], networks["log_sigma"]))
     target = net(numbers, "target_value", jax.nn.relu) if "target_value/0/weight" in numbers else networks["value"]
@@ -155,9 +161,8 @@ def update(sac_numbers):
         discount=jnp.full(11, float(sac_numbers["gamma"])),
         valid=jnp.ones(11, bool),
     )
-    return controller, jax.grad(loss, has_aux=True)(
-        controller, batch, jnp.array(sac_numbers["noise"]), regulariser=1e-3
-    )
+    learn = jax.jit(partial(jax.grad(loss, has_aux=True), regulariser=1e-3))
+    return controller, learn(controller, batch, jnp.array(sac_numbers["noise"]))
 
 
 def test_losses_equal_the_authors(sac_numbers, update):
@@ -174,5 +179,5 @@ def test_gradients_of_the_losses_equal_the_authors(sac_numbers, update):
 
 def test_target_value_moves_as_the_authors(sac_numbers, update):
     controller = update[0]
-    after = soft_update(controller.target_value, controller.value, 0.005)
+    after = jax.jit(partial(soft_update, tau=0.005))(controller.target_value, controller.value)
     jax.tree.map(close, after, net(with_weights(sac_numbers, "after/"), "target_value", jax.nn.relu))

@@ -51,15 +51,15 @@ def test_kl_is_the_mean_log_ratio_of_samples():
     ratio = gaussian_log_prob(x, *(jnp.full_like(x, v) for v in q)) - gaussian_log_prob(
         x, *(jnp.full_like(x, v) for v in p)
     )
-    kl = gaussian_kl(*(jnp.array(v) for v in (*q, *p)))
-    assert float(kl) == pytest.approx(float(ratio.mean()), abs=0.01)
-    assert float(gaussian_kl(*(jnp.array(v) for v in (*q, *q)))) == pytest.approx(0, abs=1e-6)
+    kl = jax.jit(gaussian_kl)
+    assert float(kl(*(jnp.array(v) for v in (*q, *p)))) == pytest.approx(float(ratio.mean()), abs=0.01)
+    assert float(kl(*(jnp.array(v) for v in (*q, *q)))) == pytest.approx(0, abs=1e-6)
 
 
 def test_density_of_squashed_actions_integrates_to_one():
     mean, log_sigma = jnp.array([0.4]), jnp.array([-0.5])
     noise = jnp.linspace(-6, 6, 20_001)[:, None]
-    action, log_prob = jax.vmap(lambda n: tanh_gaussian(mean, log_sigma, n))(noise)
+    action, log_prob = jax.jit(jax.vmap(lambda n: tanh_gaussian(mean, log_sigma, n)))(noise)
     assert float(np.trapezoid(np.exp(log_prob), action[:, 0])) == pytest.approx(1, abs=1e-3)
 
 
@@ -85,10 +85,10 @@ def test_rest_continues_from_the_first_layer():
 def test_a_scale_has_the_moments_of_all_valid_vectors_and_makes_them_standard():
     x = 3.0 + jax.random.normal(jax.random.key(0), (4, 6, 5, 2)) * jnp.array([0.01, 2.0])[None, None, None]
     valid = jnp.ones((6, 5), bool).at[2, 1:].set(False)
-    known, blind = initial_statistics(2), initial_statistics(2)
+    known, blind, update = initial_statistics(2), initial_statistics(2), jax.jit(update_statistics)
     for batch in x:
-        known = update_statistics(known, batch, valid)
-        blind = update_statistics(blind, jnp.where(valid[..., None], batch, 1e6), valid)
+        known = update(known, batch, valid)
+        blind = update(blind, jnp.where(valid[..., None], batch, 1e6), valid)
     seen = np.asarray(x)[:, np.asarray(valid)].reshape(-1, 2)
     np.testing.assert_allclose(known.mean, seen.mean(0), rtol=1e-5)
     np.testing.assert_allclose(jnp.sqrt(known.variance), seen.std(0), rtol=0.05)  # batches have means of their own

@@ -1,3 +1,5 @@
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,9 +27,15 @@ def fill(replay, numbers, firsts, keep):
 
 
 def filled(capacity, firsts, keep=None):
-    firsts = np.asarray(firsts, bool)
-    keep = np.ones(len(firsts), bool) if keep is None else np.asarray(keep)
-    return fill(ring.init(moment(0, False), capacity), jnp.arange(len(firsts)), jnp.asarray(firsts), jnp.asarray(keep))
+    """A ring after these moments; the rest up to 40 is masked, so that one program serves every length."""
+    keep = np.ones(len(firsts), bool) if keep is None else keep
+    firsts, keep = (np.pad(np.asarray(flags, bool), (0, 40 - len(flags))) for flags in (firsts, keep))
+    return fill(empty(capacity), np.arange(40), firsts, keep)
+
+
+@functools.cache
+def empty(capacity):
+    return ring.init(moment(0, False), capacity)
 
 
 sample = jax.jit(ring.sample, static_argnums=(2, 3))
@@ -71,6 +79,10 @@ def test_a_masked_addition_leaves_the_ring_alone():
     replay = filled(64, np.zeros(20, bool), keep)
     assert int(replay.added) == keep.sum()
     np.testing.assert_array_equal(replay.moments.note[0][: keep.sum()], np.arange(20)[keep])
+
+
+def test_an_addition_is_masked_only_where_asked():
+    assert int(jax.jit(ring.add)(empty(8), moment(1, False)).added) == 1
 
 
 def test_starts_are_uniform():

@@ -8,20 +8,24 @@ from beliefrl.training import rollout
 from worlds import Counting, CountingAgent
 
 AGENT = CountingAgent()
+STATE = AGENT.init(jax.random.key(0), Counting().spec)
 
 
 def advanced(task, steps, key=0):
     """The replay after some steps, as numpy, and what the steps reported of episodes."""
-    actor = rollout.begin(AGENT, task, jax.random.key(key))
-    replay = ring.init(rollout.stored(AGENT, actor), 3 * steps)
-    state = AGENT.init(jax.random.key(0), task.spec)
+    state = STATE
 
     def step(carry, key):
         actor, replay, episode = rollout.advance(AGENT, task, state, *carry, key)
         return (actor, replay), episode
 
-    keys = jax.random.split(jax.random.key(key + 1), steps)
-    (actor, replay), episodes = jax.jit(lambda carry: jax.lax.scan(step, carry, keys))((actor, replay))
+    @jax.jit
+    def run(key_begin, key_steps):
+        actor = rollout.begin(AGENT, task, key_begin)
+        replay = ring.init(rollout.stored(AGENT, actor), 3 * steps)
+        return jax.lax.scan(step, (actor, replay), jax.random.split(key_steps, steps))
+
+    (actor, replay), episodes = run(jax.random.key(key), jax.random.key(key + 1))
     moments = jax.tree.map(lambda leaf: np.asarray(leaf)[: int(replay.added)], replay.moments)
     return moments, jax.tree.map(np.asarray, episodes), actor
 
@@ -80,7 +84,7 @@ def test_reliving_restores_notes_and_memory(steps):
     blank = blank._replace(note=jax.tree.map(lambda note: note * 0 - 9, blank.note))
     replay = ring.Replay(blank, jnp.array(moments.step.reward.shape[0]))
     spec = Counting().spec
-    state = AGENT.init(jax.random.key(0), spec)
+    state = STATE
     again, replay = jax.jit(lambda a, r: rollout.refresh(AGENT, spec, state, a, r, jax.random.key(1), 20))(
         actor, replay
     )
@@ -90,7 +94,7 @@ def test_reliving_restores_notes_and_memory(steps):
 
 def test_evaluation_plays_whole_episodes_and_stops_counting_at_their_end():
     explore = jnp.array([True, True, False])
-    state = AGENT.init(jax.random.key(0), Counting().spec)
+    state = STATE
     for task, total, length in ((Counting(), 28, 7), (Counting(ends=4), 10, 4)):
         result = jax.jit(lambda key, task=task: rollout.evaluate(AGENT, task, state, key, explore))(jax.random.key(0))
         assert result.done.all()

@@ -1,0 +1,164 @@
+"""Soft actor-critic, besides the numbers of `test_golden`: what is masked, what each optimiser moves, how it starts."""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from beliefrl.models import soft_actor_critic as sac
+from beliefrl.models.nets import tanh_gaussian
+from beliefrl.models.soft_actor_critic import Actor, Batch, Optimisers
+
+BELIEF, ACTION, ROWS = 5, 2, 6
+RATES = {"actor": 0.25, "critic": 0.5, "alpha": 0.125}
+
+
+@partial(jax.jit, static_argnames=("actor_size", "value_start"))
+def init(key, **options):
+    return sac.init_controller(BELIEF, ACTION, (4,), (3,), key, **options)
+
+
+@pytest.fixture(scope="module")
+def controller():
+    controller = init(jax.random.key(0))
+    return controller._replace(log_alpha=jnp.array(0.3), target_value=init(jax.random.key(1)).value)
+
+
+@pytest.fixture(scope="module")
+def batch():
+    random = np.random.default_rng(0)
+    return Batch(
+        *(jnp.asarray(random.normal(size=(ROWS, size)), jnp.float32) for size in (BELIEF, BELIEF, ACTION)),
+        reward=jnp.arange(float(ROWS)),
+        terminated=jnp.array([False, True, False, False, True, False]),
+        discount=jnp.full(ROWS, 0.5),
+        valid=jnp.array([True, True, False, True, False, True]),
+    )
+
+
+NOISE = jnp.asarray(np.random.default_rng(1).normal(size=(ROWS, ACTION)), jnp.float32)
+loss = jax.jit(jax.value_and_grad(sac.loss, has_aux=True), static_argnames=("regulariser", "target_entropy"))
+
+
+def shapes(network):
+    return [layer.weight.shape for layer in network.layers]
+
+
+def test_a_controller_starts_with_its_target_at_the_value_and_its_temperature_at_one():
+    start = init(jax.random.key(0))
+    assert float(start.log_alpha) == 0
+    jax.tree.map(np.testing.assert_array_equal, start.target_value, start.value)
+    assert shapes(start.actor.mean) == shapes(start.actor.log_sigma) == [(4, BELIEF), (ACTION, 4)]
+    assert [shapes(critic) for critic in start.critics] == [[(3, BELIEF + ACTION), (1, 3)]] * 2
+    assert shapes(start.value) == [(3, BELIEF), (1, 3)]
+    first, second = start.critics
+    assert np.any(first.layers[0].weight != second.layers[0].weight)
+
+
+def test_the_actors_input_has_a_size_of_its_own_and_values_a_start():
+    plain, other = (init(jax.random.key(0), actor_size=9, value_start=start) for start in (0.0, 7.0))
+    assert shapes(other.actor.mean) == shapes(other.actor.log_sigma) == [(4, 9), (ACTION, 4)]
+    raised = (*other.critics, other.value, other.target_value)
+    for high, low in zip(raised, (*plain.critics, plain.value, plain.target_value), strict=True):
+        np.testing.assert_allclose(high.layers[-1].bias - low.layers[-1].bias, 7.0, rtol=1e-5)
+        np.testing.assert_array_equal(high.layers[0].bias, low.layers[0].bias)
+
+
+@pytest.mark.parametrize(("bias", "clipped"), [([-50.0, 50.0], [-20.0, 2.0]), ([-19.0, 1.5], [-19.0, 1.5])])
+def test_log_sigma_is_clipped(controller, bias, clipped):
+    where = lambda actor: (actor.log_sigma.layers[-1].weight, actor.log_sigma.layers[-1].bias)  # noqa: E731
+    actor = eqx.tree_at(where, controller.actor, (jnp.zeros((ACTION, 4)), jnp.array(bias)))
+    np.testing.assert_allclose(jax.jit(Actor.__call__)(actor, jnp.ones(BELIEF))[1], clipped)
+
+
+def test_the_mean_counts_what_is_valid_and_is_zero_where_nothing_is():
+    mean, x = jax.jit(sac.valid_mean), jnp.array([1.0, jnp.nan, 4.0])
+    assert float(mean(x, jnp.array([True, False, True]))) == 2.5
+    assert float(mean(x, jnp.array([True, False, False]))) == 1.0
+    assert float(mean(x, jnp.zeros(3, bool))) == 0.0
+
+
+def test_rows_that_are_not_valid_and_values_after_a_terminal_moment_enter_no_loss(controller, batch):
+    valid, terminated = batch.valid[:, None], batch.terminated[:, None]
+    other = batch._replace(
+        belief=jnp.where(valid, batch.belief, 3.0),
+        next_belief=jnp.where(valid & ~terminated, batch.next_belief, 3.0),
+        action=jnp.where(valid, batch.action, 0.1),
+        reward=jnp.where(batch.valid, batch.reward, 50.0),
+    )
+    results = [loss(controller, each, NOISE, regulariser=1e-3) for each in (batch, other)]
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7), *results)
+    later = batch._replace(next_belief=batch.next_belief.at[0].add(1.0))
+    assert loss(controller, later, NOISE, regulariser=1e-3)[0][1]["loss_q"] != results[0][0][1]["loss_q"]
+
+
+def test_the_losses_are_the_equations(controller, batch):
+    """With V, V̄, Q and π from the networks, in plain numpy."""
+
+    @jax.jit
+    def parts():
+        mean, log_sigma = jax.vmap(controller.actor)(batch.belief)
+        action, log_prob = jax.vmap(tanh_gaussian)(mean, log_sigma, NOISE)
+        q = [
+            [jax.vmap(critic)(jnp.concatenate([batch.belief, a], 1))[:, 0] for critic in controller.critics]
+            for a in (batch.action, action)
+        ]
+        values = [sac.state_value(controller.value, batch.belief)]
+        return mean, log_sigma, log_prob, *q, *values, sac.state_value(controller.target_value, batch.next_belief)
+
+    mean, log_sigma, log_prob, q, q_new, value, after = jax.tree.map(np.asarray, parts())
+    rows, alpha, lowest = np.asarray(batch.valid), np.exp(0.3), np.minimum(*q_new)
+    target = np.asarray(batch.reward) + 0.5 * np.where(batch.terminated, 0.0, after)
+    size = np.mean(mean**2, 1) + np.mean(np.exp(2 * log_sigma), 1)
+    j_pi = np.mean((alpha * log_prob - lowest + 0.5 * 0.1 * size)[rows])
+    j_v = np.mean(0.5 * (value - (lowest - alpha * log_prob))[rows] ** 2)
+    j_q = np.mean(sum(0.5 * (each - target) ** 2 for each in q)[rows])
+    expected = {"loss_actor": j_pi, "loss_value": j_v, "loss_q": j_q, "alpha": alpha}
+    expected |= {"entropy": -np.mean(log_prob[rows]), "q": np.mean(lowest[rows])}
+    for target_entropy, wanted in ((None, -2.0), (1.5, 1.5)):
+        (total, metrics), gradient = loss(controller, batch, NOISE, regulariser=0.1, target_entropy=target_entropy)
+        assert {name: float(value) for name, value in metrics.items()} == pytest.approx(expected, rel=1e-4)
+        j_alpha = -0.3 * np.mean(log_prob[rows] + wanted)
+        assert float(total) == pytest.approx(j_pi + j_v + j_q + j_alpha, rel=1e-4)
+        assert float(gradient.log_alpha) == pytest.approx(j_alpha / 0.3, rel=1e-4)
+    assert not any(np.any(leaf) for leaf in jax.tree.leaves(gradient.target_value))
+
+
+def test_the_actor_reads_its_own_input_and_learns_from_no_belief_through_q(controller, batch):
+    @jax.jit
+    def slopes(belief, actor_input):
+        def j_pi(belief, actor_input):
+            given = batch._replace(belief=belief, actor_input=actor_input)
+            return sac.actor_loss(controller.actor, controller, given, NOISE, 0.1)[0]
+
+        return jax.value_and_grad(j_pi, (0, 1))(belief, actor_input)
+
+    value, (by_belief, by_input) = slopes(batch.belief, batch.belief)
+    assert float(value) == pytest.approx(float(loss(controller, batch, NOISE, regulariser=0.1)[0][1]["loss_actor"]))
+    assert not np.any(by_belief)
+    assert np.any(by_input)
+    assert slopes(batch.belief, batch.belief + 1)[0] != value
+
+
+def test_every_group_has_its_optimiser_and_the_target_follows_the_new_value(controller):
+    optimisers = Optimisers(*(optax.sgd(RATES[name]) for name in Optimisers._fields))
+    gradient = jax.tree.map(jnp.ones_like, controller)
+    step = jax.jit(
+        lambda: sac.update(optimisers, sac.init_optimisers(optimisers, controller), controller, gradient, 0.1)
+    )
+    after, _ = step()
+
+    def moved(part, by):
+        old, new = (getattr(each, part) for each in (controller, after))
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a - b, by, rtol=1e-4), old, new)
+
+    moved("actor", 0.25)
+    moved("critics", 0.5)
+    moved("value", 0.5)
+    moved("log_alpha", 0.125)
+    expected = jax.tree.map(lambda old, new: 0.9 * old + 0.1 * new, controller.target_value, after.value)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), after.target_value, expected)
