@@ -108,7 +108,9 @@ def altered(run, tmp_path):
 
 
 def test_a_class_without_a_recorded_field_is_one_sentence(altered):
-    with pytest.raises(UserError, match=r"config\.json.* cannot be used: .* has no hyperparameter 'colour': it has step"):
+    with pytest.raises(
+        UserError, match=r"config\.json.* cannot be used: .* has no hyperparameter 'colour': it has step"
+    ):
         agent_of(altered(hyperparameters={"colour": 1}), Foreteller)
 
 
