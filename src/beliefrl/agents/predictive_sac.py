@@ -4,9 +4,9 @@ The belief is s_t = [h_t, x_t], h_t the LSTM's state and x_t = (o_t, a_{t-1}, r_
 statistics. The LSTM learns all the time and only by predicting the next observation and reward
 (`models.predictive_model`); the controller (`models.double_q`) learns on the belief and sends no gradient back.
 
-This agent is not from the paper. What it keeps of it: a recurrent model that learns by prediction forms the belief, and
-a soft actor-critic acts on it. What differs from `vrm`: one model instead of two, without latent variables and without a
-frozen copy; standardised inputs; returns of several steps; no V.
+This agent is not from the paper. It keeps the paper's idea: a recurrent model that learns by prediction forms the
+belief, and a soft actor-critic acts on it. It differs from `vrm` in this: one model instead of two, without latent
+variables and without a frozen copy; standardised inputs; returns of several steps; no V.
 
 One unroll serves both: the windows of a cycle teach the model, and the beliefs formed on the way become transitions.
 These go into a pool that holds those of the last `pool` cycles, and the controller's batches are drawn from it: the
@@ -215,9 +215,7 @@ class PredictiveSACAgent:
         state, _, metrics = self.learn_model(state, windows)
         return state, metrics
 
-    def learn_model(
-        self, state: State, windows: Window
-    ) -> tuple[State, Float[Array, "kept batch belief"], Metrics]:
+    def learn_model(self, state: State, windows: Window) -> tuple[State, Float[Array, "kept batch belief"], Metrics]:
         """One Adam step on J_model; beside it the beliefs from the end of the burn-in on, formed before the step."""
         scales, step = state.scales, windows.step
         obs = update_statistics(scales.obs, step.obs, windows.exists)

@@ -136,7 +136,9 @@ def rescale(controller: Controller, y: Float[Array, " batch"], valid: Bool[Array
     new = Unit(old.square + rate * (valid_mean(y**2, valid) - old.square), old.batches + 1)
 
     def rescaled(critic: MLP) -> MLP:
-        return eqx.tree_at(lambda critic: critic.layers[-1], critic, replace_fn=lambda last: jax.tree.map(by_ratio, last))
+        return eqx.tree_at(
+            lambda critic: critic.layers[-1], critic, replace_fn=lambda last: jax.tree.map(by_ratio, last)
+        )
 
     def by_ratio(leaf: Array) -> Array:
         return leaf * (old.u / new.u)

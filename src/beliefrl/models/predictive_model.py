@@ -42,15 +42,13 @@ class PredictiveModel(eqx.Module):
             start = jax.tree.map(lambda leaf: leaf[-1], burnt_in)
         return self.lstm.unroll(start, x[burn_in:], is_first[burn_in:]).d
 
-    def next_state(
-        self, state: LSTMState, x: Float[Array, " x"], is_first: Bool[Array, ""]
-    ) -> LSTMState:
+    def next_state(self, state: LSTMState, x: Float[Array, " x"], is_first: Bool[Array, ""]) -> LSTMState:
         """The LSTM's state after x_t."""
         start = jax.tree.map(lambda leaf: leaf[None], state)
         after = self.lstm.unroll(start, x[None, None], is_first[None, None])
         return jax.tree.map(lambda leaf: leaf[0, 0], after)
 
-    def predict(self, d: Float[Array, " d"], action: Float[Array, " action"]) -> Float[Array, " obs+1"]:
+    def predict(self, d: Float[Array, " d"], action: Float[Array, " action"]) -> Float[Array, " prediction"]:
         """(o_{t+1}, r_t) in standardised units, given h_t and a_t."""
         return self.predictor(jnp.concatenate([d, action]))
 
@@ -71,7 +69,7 @@ def prediction_loss(
     model: PredictiveModel,
     d: Float[Array, "time batch d"],
     action: Float[Array, "length batch action"],
-    target: Float[Array, "length batch obs+1"],
+    target: Float[Array, "length batch prediction"],
     valid: Bool[Array, "length batch"],
 ) -> Float[Array, ""]:
     """J_model of the transitions that begin at all timesteps but the last; mean over the valid ones."""
