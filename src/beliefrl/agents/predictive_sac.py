@@ -84,9 +84,9 @@ class PredictiveSACAgent:
     """Adam's learning rate for the actor."""
     lr_critic: float = 1e-3
     """Adam's learning rate for both Q."""
-    lr_alpha: float = 3e-4
+    lr_alpha: float = 1e-3
     """Adam's learning rate for log α, the temperature."""
-    alpha_start: float = 0.1
+    alpha_start: float = 0.01
     """α before training, in units of the returns."""
     target_entropy: float | None = None
     """Entropy that α aims at; None is minus the number of actions."""
@@ -127,7 +127,8 @@ class PredictiveSACAgent:
         check_range(self, ("policy_layers", "value_layers", "d_size", "hidden_size"), 1, WIDEST)
         check_range(self, ("n_step",), 1, MOST_STEPS)
         check_range(self, ("step_start_rl",), 2)  # fewer timesteps hold no transition
-        check_range(self, ("burn_in", "pretrain_updates", "actor_regulariser", "alpha_start"), 0)
+        check_range(self, ("burn_in", "pretrain_updates", "actor_regulariser"), 0)
+        check_range(self, ("alpha_start",), 1e-6)
         check_range(self, ("lr_actor", "lr_critic", "lr_alpha", "lr_model", "gamma", "tau", "long_memories"), 0, 1)
         if self.target_entropy is not None:
             check_range(self, ("target_entropy",), -LARGEST)

@@ -13,6 +13,7 @@ temperature fit tasks with returns of any size. Departure: y holds no entropy. O
 more than the rewards of most tasks, and with α in units of u it would be a feedback of u on itself.
 """
 
+import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -103,7 +104,7 @@ def init_controller(
     critic = MLP((belief + action, *value_layers, 1), jax.nn.relu)
     actor, critics = draw(key, (Actor(belief, action, policy_layers), (critic, critic)))
     unit = Unit(jnp.ones(()), jnp.zeros(()))
-    return Controller(actor, critics, jax.tree.map(jnp.copy, critics), jnp.log(jnp.array(alpha)), unit)
+    return Controller(actor, critics, jax.tree.map(jnp.copy, critics), jnp.full((), math.log(alpha)), unit)
 
 
 def least(
