@@ -9,7 +9,17 @@ import pytest
 from beliefrl import cli
 from mistakes import MISTAKES, TRAIN, prepare
 
-AGENTS = {"vrm", "sac-mlp", "sac-lstm", "slac", "vrm-single", "vrm-first", "vrm-keep", "vrm-deterministic"}
+AGENTS = {
+    "vrm",
+    "sac-mlp",
+    "sac-lstm",
+    "slac",
+    "predictive-sac",
+    "vrm-single",
+    "vrm-first",
+    "vrm-keep",
+    "vrm-deterministic",
+}
 TASKS = {"pendulum", "pendulum-v", "pendulum-p", "cartpole", "cartpole-v", "cartpole-p", "target-reaching"}
 ROBOTS = {name + mask for name in ("hopper", "walker2d", "ant", "halfcheetah") for mask in ("", "-v", "-p")}
 

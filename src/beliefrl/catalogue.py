@@ -31,6 +31,7 @@ AGENTS: dict[str, Named] = {
     "sac-mlp": Named("beliefrl.agents.sac_mlp:SACMLPAgent"),
     "sac-lstm": Named("beliefrl.agents.sac_lstm:SACLSTMAgent"),
     "slac": Named("beliefrl.agents.slac:SLACAgent"),
+    "predictive-sac": Named("beliefrl.agents.predictive_sac:PredictiveSACAgent"),
     "vrm-single": Named(VRM, "Ablation: one model that is pre-trained and keeps learning.", {"models": "single"}),
     "vrm-first": Named(VRM, "Ablation: only the first-impression model.", {"models": "first"}),
     "vrm-keep": Named(VRM, "Ablation: only the keep-learning model.", {"models": "keep"}),

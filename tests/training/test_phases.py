@@ -16,6 +16,14 @@ SMALL = {
     "vrm-single": MODELS | SEQUENCES,
     "sac-mlp": {"batch_size": 8, "pretrain_updates": 10, "standardise": True},
     "sac-lstm": {"d_size": 8, "pretrain_updates": 10} | SEQUENCES,
+    "predictive-sac": {
+        "d_size": 8,
+        "hidden_size": 8,
+        "pretrain_updates": 10,
+        "seq_len": 8,
+        "burn_in": 4,
+        "sequences": 2,
+    },
     "slac": {"z1_size": 2, "z2_size": 4, "model_layers": (8,), "batch_size": 2, "pretrain_updates": 10},
 }
 
@@ -161,3 +169,13 @@ def test_evaluation_leaves_training_alone_and_separates_modes():
 def test_the_replay_has_room_for_a_training_and_little_more(steps, limit, expected):
     options = Options(steps=steps, replay_capacity=limit)
     assert schedule.capacity(agents.make("sac-mlp"), options) == expected
+
+
+def test_a_weak_type_in_an_agents_state_does_not_compile_learning_twice():
+    class Weak(CountingAgent):
+        def init(self, key, spec):
+            return super().init(key, spec)._replace(offset=jnp.where(True, 0.0, 1.0))
+
+    program = phases.compile_program(Weak(), Counting(), capacity=90, episodes=2)
+    before = program.shapes(jax.random.split(jax.random.key(0), 2))
+    assert not any(leaf.weak_type for leaf in jax.tree.leaves(before))

@@ -137,13 +137,14 @@ def test_what_is_no_unfinished_training_is_not_cleared(whole, tmp_path, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["vrm", "sac-lstm", "slac"])
+@pytest.mark.parametrize("name", ["vrm", "sac-lstm", "slac", "predictive-sac"])
 def test_every_agent_goes_on_to_the_last_bit(tmp_path, name):
     models = {"train_times_fivrm": 10, "d_size": 8, "z_size": 4, "hidden_size": 8}
     sequences = {"seq_len": 8, "burn_in": 4, "batch_size": 2}
     sizes = {
         "vrm": models | sequences,
         "sac-lstm": {"d_size": 8, "pretrain_updates": 10} | sequences,
+        "predictive-sac": {"d_size": 8, "hidden_size": 8, "pretrain_updates": 10, "seq_len": 8, "burn_in": 4},
         "slac": {"z1_size": 2, "z2_size": 4, "model_layers": (8,), "batch_size": 2, "pretrain_updates": 10},
     }
     agent = agents.make(name, step_start_rl=20, policy_layers=(8,), value_layers=(8,), **sizes[name])

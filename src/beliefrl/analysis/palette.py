@@ -11,6 +11,7 @@ AGENTS = {
     "sac-mlp": "#d55e00",
     "sac-lstm": "#009e73",
     "slac": "#cc79a7",
+    "predictive-sac": "#9a8700",
     "vrm-single": "#332288",
     "vrm-first": "#aa3377",
     "vrm-keep": "#661100",

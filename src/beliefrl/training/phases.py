@@ -63,7 +63,8 @@ def seed_of(
     agent: Agent, spec: Spec, capacity: int, actor: ActorState, key_state: Key[Array, ""], key: Key[Array, ""]
 ) -> SeedState:
     """A new agent and an empty replay for an actor at its first timestep."""
-    return SeedState(agent.init(key_state, spec), actor, ring.init(rollout.stored(agent, actor), capacity), key)
+    state = rollout.strong(agent.init(key_state, spec))
+    return SeedState(state, actor, ring.init(rollout.stored(agent, actor), capacity), key)
 
 
 def _no_episodes(agent: Agent, seeds: SeedState) -> Episode:

@@ -11,7 +11,7 @@ So every step of the loop is one step of the environment, and the current timest
 All functions are for one seed; `phases` maps them over seeds.
 """
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,8 @@ from beliefrl.tasks import Task
 from beliefrl.training import replay as ring
 from beliefrl.training.replay import Replay
 from beliefrl.types import Spec, StoredTimestep, Timestep
+
+Tree = TypeVar("Tree")
 
 
 class ActorState(NamedTuple):
@@ -43,14 +45,15 @@ class Episode(NamedTuple):
     success: Bool[Array, "*batch"]
 
 
-def _strong(actor: ActorState) -> ActorState:
-    """The same without weak types, as Python's numbers in a task leave them: they would make XLA compile twice."""
+def strong(tree: Tree) -> Tree:
+    """The same without weak types, which Python's numbers in a task or agent leave: XLA would compile twice."""
 
-    def cast(leaf: Array) -> Array:
+    def cast(leaf: Any) -> Array:
+        leaf = jnp.asarray(leaf)
         is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
         return leaf if is_key else jax.lax.convert_element_type(leaf, leaf.dtype)
 
-    return jax.tree.map(cast, actor)
+    return jax.tree.map(cast, tree)
 
 
 def first(agent: Agent, spec: Spec, task_state: Any, obs: Float[Array, " obs"]) -> ActorState:
@@ -62,7 +65,7 @@ def first(agent: Agent, spec: Spec, task_state: Any, obs: Float[Array, " obs"]) 
         is_first=jnp.array(True),
         terminated=jnp.array(False),
     )
-    return _strong(ActorState(task_state, step, agent.reset(spec), jnp.array(0), jnp.array(0.0)))
+    return strong(ActorState(task_state, step, agent.reset(spec), jnp.array(0), jnp.array(0.0)))
 
 
 def begin(agent: Agent, task: Task, key: Key[Array, ""]) -> ActorState:
@@ -94,7 +97,7 @@ def arrive(
 ) -> ActorState:
     """The next timestep, terminal or not, with the memory after the one before it."""
     step = Timestep(obs, reward, action, jnp.array(False), terminated)
-    return _strong(ActorState(task_state, step, memory, actor.length + 1, actor.episode_return + reward))
+    return strong(ActorState(task_state, step, memory, actor.length + 1, actor.episode_return + reward))
 
 
 def move(
@@ -156,7 +159,7 @@ def refresh(
 
     memory, notes = jax.lax.scan(perceive, empty, (steps, exists, jax.random.split(key, length)))
     memory = jax.tree.map(lambda old, new: jnp.where(actor.step.is_first, old, new), empty, memory)
-    return _strong(actor._replace(memory=memory)), ring.annotate(replay, notes, length)
+    return strong(actor._replace(memory=memory)), ring.annotate(replay, notes, length)
 
 
 def evaluate(agent: Agent, task: Task, state: Any, key: Key[Array, ""], explore: Bool[Array, " episodes"]) -> Episode:

@@ -1,0 +1,277 @@
+"""Predictive SAC: a soft actor-critic on the state of one LSTM that learns only to predict.
+
+The belief is s_t = [h_t, x_t], h_t the LSTM's state and x_t = (o_t, a_{t-1}, r_{t-1}), all standardised by running
+statistics. The LSTM learns all the time and only by predicting the next observation and reward
+(`models.predictive_model`); the controller (`models.double_q`) learns on the belief and sends no gradient back.
+
+This agent is not from the paper. It keeps the paper's idea: a recurrent model that learns by prediction forms the
+belief, and a soft actor-critic acts on it. It differs from `vrm` in this: one model instead of two, without latent
+variables and without a frozen copy; standardised inputs; returns of several steps; no V.
+
+One unroll serves both: the windows of a cycle teach the model, and the beliefs formed on the way become transitions.
+These go into a pool that holds those of the last `pool` cycles, and the controller's batches are drawn from it: the
+windows of one cycle are too few and too much alike for a batch.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from beliefrl.agents.base import MOST_STEPS, Metrics
+from beliefrl.models import double_q
+from beliefrl.models.double_q import Controller, Optimisers, OptimiserState
+from beliefrl.models.nets import (
+    LSTMState,
+    RunningStatistics,
+    descend,
+    initial_statistics,
+    standardise,
+    tanh_gaussian,
+    update_statistics,
+)
+from beliefrl.models.predictive_model import PredictiveModel, init_model, prediction_loss
+from beliefrl.models.returns import transition_batch
+from beliefrl.models.soft_actor_critic import Batch
+from beliefrl.types import LARGEST, WIDEST, Spec, Timestep, Window, WindowShape, check_range, transitions
+
+
+class Scales(NamedTuple):
+    """Running statistics, by which inputs are standardised."""
+
+    obs: RunningStatistics
+    reward: RunningStatistics
+    belief: RunningStatistics
+
+
+class Pool(NamedTuple):
+    """The transitions of the last cycles, beliefs not standardised."""
+
+    transitions: Batch  # leaves (pool, windows · length, ...)
+    cycles: Int[Array, ""]  # so far
+
+
+class State(NamedTuple):
+    """Everything that training changes."""
+
+    model: PredictiveModel
+    controller: Controller
+    scales: Scales
+    pool: Pool
+    model_optimiser: optax.OptState
+    controller_optimiser: OptimiserState
+
+
+@dataclasses.dataclass(frozen=True)
+class PredictiveSACAgent:
+    """Soft actor-critic on an LSTM that learns only to predict observations and rewards. It is not in the paper."""
+
+    # The controller
+    gamma: float = 0.995
+    """Discount factor γ, in [0, 1]."""
+    n_step: int = 5
+    """Steps of the critics' returns."""
+    step_start_rl: int = 1000
+    """Environment steps before training starts; the untrained policy acts until then."""
+    train_interval_rl: int = 1
+    """Environment steps of a cycle: between two updates of the model, and as many of the controller."""
+    batch_size: int = 256
+    """Transitions in an update of the controller."""
+    lr_actor: float = 1e-3
+    """Adam's learning rate for the actor."""
+    lr_critic: float = 1e-3
+    """Adam's learning rate for both Q."""
+    lr_alpha: float = 1e-3
+    """Adam's learning rate for log α, the temperature."""
+    alpha_start: float = 0.01
+    """α before training, in units of the returns."""
+    target_entropy: float | None = None
+    """Entropy that α aims at; None is minus the number of actions."""
+    tau: float = 0.005
+    """Fraction by which the target Qs move at each update, in [0, 1]."""
+    policy_layers: tuple[int, ...] = (128, 128)
+    """Hidden layers of the actor."""
+    value_layers: tuple[int, ...] = (128, 128)
+    """Hidden layers of each Q."""
+    actor_regulariser: float = 1e-3
+    """Weight of half the mean square of the policy's μ in the actor's loss."""
+
+    # The model
+    pretrain_updates: int = 1000
+    """Updates of the model alone at step_start_rl."""
+    lr_model: float = 1e-3
+    """Adam's learning rate for the model."""
+    seq_len: int = 32
+    """Steps in a sampled sequence."""
+    sequences: int = 8
+    """Sequences in an update of the model."""
+    burn_in: int = 32
+    """Most steps before a sequence that are unrolled from a zero state to begin it."""
+    d_size: int = 128
+    """Size of the LSTM's state h."""
+    hidden_size: int = 128
+    """Width of the predictor's hidden layer."""
+    long_memories: float = 0.25
+    """Fraction of the LSTM's cells that begin with a long memory, in [0, 1]."""
+    longest_memory: int = 127
+    """Steps over which the slowest of these cells forgets when training begins."""
+    pool: int = 8
+    """Cycles whose transitions the controller's batches are drawn from."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible values with a UserError."""
+        check_range(self, ("train_interval_rl", "batch_size", "seq_len", "sequences", "pool", "longest_memory"), 1)
+        check_range(self, ("policy_layers", "value_layers", "d_size", "hidden_size"), 1, WIDEST)
+        check_range(self, ("n_step",), 1, MOST_STEPS)
+        check_range(self, ("step_start_rl",), 2)  # fewer timesteps hold no transition
+        check_range(self, ("burn_in", "pretrain_updates", "actor_regulariser"), 0)
+        check_range(self, ("alpha_start",), 1e-6)
+        check_range(self, ("lr_actor", "lr_critic", "lr_alpha", "lr_model", "gamma", "tau", "long_memories"), 0, 1)
+        if self.target_entropy is not None:
+            check_range(self, ("target_entropy",), -LARGEST)
+
+    # How it is trained
+
+    @property
+    def cycle(self) -> int:
+        return self.train_interval_rl
+
+    @property
+    def window(self) -> WindowShape:
+        return WindowShape(self.burn_in, self.seq_len)
+
+    @property
+    def losses(self) -> tuple[str, ...]:
+        return "loss_q", "loss_actor", "loss_model"
+
+    @property
+    def pretrain_windows(self) -> int:
+        return self.sequences
+
+    @property
+    def cycle_windows(self) -> int:
+        return self.sequences
+
+    @property
+    def model_optimiser(self) -> optax.GradientTransformation:
+        return optax.adam(self.lr_model)
+
+    @property
+    def optimisers(self) -> Optimisers:
+        return Optimisers(optax.adam(self.lr_actor), optax.adam(self.lr_critic), optax.adam(self.lr_alpha))
+
+    def init(self, key: Key[Array, ""], spec: Spec) -> State:
+        key_model, key_controller = jax.random.split(key)
+        sizes = spec.obs_dim, spec.action_dim
+        model = init_model(key_model, *sizes, self.d_size, self.hidden_size, self.long_memories, self.longest_memory)
+        belief = self.d_size + spec.obs_dim + spec.action_dim + 1
+        layers = self.policy_layers, self.value_layers
+        controller = double_q.init_controller(key_controller, belief, spec.action_dim, *layers, self.alpha_start)
+        scales = Scales(*map(initial_statistics, (spec.obs_dim, 1, belief)))
+        model_optimiser = self.model_optimiser.init(model)  # pyright: ignore[reportArgumentType]
+        pool = self.empty_pool(belief, spec.action_dim)
+        return State(model, controller, scales, pool, model_optimiser, self.optimisers.init(controller))
+
+    def empty_pool(self, belief: int, action: int) -> Pool:
+        def zeros(*shape: int) -> Float[Array, "pool transitions *shape"]:
+            return jnp.zeros((self.pool, self.sequences * self.seq_len, *shape))
+
+        none = zeros().astype(bool)
+        batch = Batch(zeros(belief), zeros(belief), zeros(action), zeros(), none, zeros(), none)
+        return Pool(batch, jnp.zeros((), int))
+
+    def networks(self, state: State) -> State:
+        """The state without its optimisers and the pool."""
+        return state._replace(pool=(), model_optimiser=(), controller_optimiser=())
+
+    # Acting
+
+    def perception(self, scales: Scales, step: Timestep) -> Float[Array, "*batch x"]:
+        """x_t = (o_t, a_{t-1}, r_{t-1}), observation and reward standardised."""
+        obs, reward = standardise(scales.obs, step.obs), standardise(scales.reward, step.reward[..., None])
+        return jnp.concatenate([obs, step.prev_action, reward], axis=-1)
+
+    def reset(self, spec: Spec) -> LSTMState:
+        return LSTMState(jnp.zeros(self.d_size), jnp.zeros(self.d_size))
+
+    def act(
+        self, state: State, memory: LSTMState, step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]
+    ) -> tuple[Float[Array, " action"], LSTMState]:
+        x = self.perception(state.scales, step)
+        memory = state.model.next_state(memory, x, step.is_first)
+        belief = standardise(state.scales.belief, jnp.concatenate([memory.d, x]))
+        mean, log_sigma = state.controller.actor(belief)
+        noise = jnp.where(explore, jax.random.normal(key, mean.shape), 0.0)
+        return tanh_gaussian(mean, log_sigma, noise)[0], memory
+
+    def note(self, memory: LSTMState) -> tuple[()]:
+        return ()
+
+    # Learning the model
+
+    def pretrain(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Metrics]:
+        state, _, metrics = self.learn_model(state, windows)
+        return state, metrics
+
+    def learn_model(self, state: State, windows: Window) -> tuple[State, Float[Array, "kept batch belief"], Metrics]:
+        """One Adam step on J_model; beside it the beliefs from the end of the burn-in on, formed before the step."""
+        scales, step = state.scales, windows.step
+        obs = update_statistics(scales.obs, step.obs, windows.exists)
+        reward = update_statistics(scales.reward, step.reward[..., None], windows.exists & ~step.is_first)
+        scales = scales._replace(obs=obs, reward=reward)
+        x = self.perception(scales, step)
+
+        def loss(model: PredictiveModel) -> tuple[Float[Array, ""], Float[Array, "kept batch d"]]:
+            d = model.unroll(x, step.is_first, self.burn_in)
+            after = windows.between(self.burn_in + 1, None).step
+            target = [standardise(scales.obs, after.obs), standardise(scales.reward, after.reward[..., None])]
+            valid = transitions(windows, self.burn_in)
+            return prediction_loss(model, d, after.prev_action, jnp.concatenate(target, axis=-1), valid), d
+
+        (j_model, d), gradient = jax.value_and_grad(loss, has_aux=True)(state.model)
+        model, optimiser = descend(self.model_optimiser, gradient, state.model_optimiser, state.model)
+        belief = jnp.concatenate([d, x[self.burn_in :]], axis=-1)
+        scales = scales._replace(belief=update_statistics(scales.belief, belief, windows.exists[self.burn_in :]))
+        return state._replace(model=model, model_optimiser=optimiser, scales=scales), belief, {"loss_model": j_model}
+
+    # Learning the controller
+
+    def begin_cycle(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Batch, Metrics]:
+        """One update of the model; then a batch from the pool for each update of the controller."""
+        state, belief, metrics = self.learn_model(state, windows)
+        step, valid = windows.between(self.burn_in, None).step, transitions(windows, self.burn_in)
+        batch = transition_batch(step, valid, belief, belief, self.n_step, self.gamma)
+        pool = add(state.pool, jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), batch))
+        batches = draw(pool, key, (self.cycle, self.batch_size))
+        scale = state.scales.belief
+        beliefs = {name: standardise(scale, getattr(batches, name)) for name in ("belief", "next_belief")}
+        return state._replace(pool=pool), batches._replace(**beliefs), metrics
+
+    def update(self, state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
+        controller, optimiser, metrics = double_q.update(
+            self.optimisers,
+            state.controller_optimiser,
+            state.controller,
+            batch,
+            key,
+            self.tau,
+            self.actor_regulariser,
+            self.target_entropy,
+        )
+        return state._replace(controller=controller, controller_optimiser=optimiser), metrics
+
+
+def add(pool: Pool, batch: Batch) -> Pool:
+    """The pool with the transitions of one more cycle; the oldest cycle's make room."""
+    index = pool.cycles % len(pool.transitions.reward)
+    return Pool(jax.tree.map(lambda ring, new: ring.at[index].set(new), pool.transitions, batch), pool.cycles + 1)
+
+
+def draw(pool: Pool, key: Key[Array, ""], shape: tuple[int, int]) -> Batch:
+    """Transitions drawn uniformly, leaves (*shape, ...); those that are not `valid` are drawn as well."""
+    cycles, count = pool.transitions.reward.shape
+    index = jax.random.randint(key, shape, 0, jnp.minimum(pool.cycles, cycles) * count)
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[index], pool.transitions)

@@ -1,0 +1,204 @@
+"""Soft actor-critic without V, in units of its own returns: the controller of `predictive-sac`.
+
+Source: Haarnoja et al. 2019, Algorithm 1, with s the belief and s' the one m steps later (`returns`):
+
+    y   = r + γ^m (1 - terminated) min_i Q̄_i(s', ã')
+    J_Q = E ½ ((Q_i(s, a) - y) / u)²,  summed over i
+    J_π = E α log π(ã|s) - min_i Q_i(s, ã) / u  +  regulariser · ½ E μ²
+    J_α = E -log α (log π(ã|s) + H_target)
+
+u is the root mean square of all y so far. The networks of the critics give Q / u, and their last layers are rescaled
+when u changes, so that Q stays the same (van Hasselt et al. 2016, without their mean). So one learning rate and one
+temperature fit tasks with returns of any size. Departure: y holds no entropy. Over a horizon of 200 steps that would be
+more than the rewards of most tasks, and with α in units of u it would be a feedback of u on itself.
+"""
+
+import math
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Key
+
+from beliefrl.models.nets import MLP, descend, draw, tanh_gaussian
+from beliefrl.models.soft_actor_critic import (
+    LOG_SIGMA_MAX,
+    LOG_SIGMA_MIN,
+    Batch,
+    alpha_loss,
+    q_value,
+    soft_update,
+    valid_mean,
+)
+
+UNIT_RATE = 1e-3  # least weight of a new batch in u², reached after 1 / rate batches
+UNIT_MIN = 1e-4
+
+
+class Actor(eqx.Module):
+    """π(a|s): a Gaussian squashed by tanh; one network for its mean and log σ."""
+
+    network: MLP
+
+    def __init__(self, belief: int, action: int, layers: tuple[int, ...]):
+        self.network = MLP((belief, *layers, 2 * action), jax.nn.relu)
+
+    def __call__(self, belief: Float[Array, " belief"]) -> tuple[Float[Array, " action"], Float[Array, " action"]]:
+        """μ and log σ before the tanh, log σ clipped to [-20, 2]."""
+        mean, log_sigma = jnp.split(self.network(belief), 2)
+        return mean, jnp.clip(log_sigma, LOG_SIGMA_MIN, LOG_SIGMA_MAX)
+
+
+class Unit(NamedTuple):
+    """u, the size of returns."""
+
+    square: Float[Array, ""]  # u², an average over batches, exponential after 1 / UNIT_RATE of them
+    batches: Float[Array, ""]  # so far
+
+    @property
+    def u(self) -> Float[Array, ""]:
+        return jnp.sqrt(self.square) + UNIT_MIN
+
+
+class Controller(NamedTuple):
+    """Everything that J_Q, J_π and J_α train."""
+
+    actor: Actor
+    critics: tuple[MLP, MLP]  # Q_1 / u, Q_2 / u
+    targets: tuple[MLP, MLP]  # Q̄_1 / u, Q̄_2 / u
+    log_alpha: Float[Array, ""]
+    unit: Unit
+
+
+class OptimiserState(NamedTuple):
+    actor: optax.OptState
+    critics: optax.OptState
+    alpha: optax.OptState
+
+
+class Optimisers(NamedTuple):
+    actor: optax.GradientTransformation
+    critics: optax.GradientTransformation
+    alpha: optax.GradientTransformation
+
+    def init(self, controller: Controller) -> OptimiserState:
+        """Fresh states for `update`."""
+        return OptimiserState(
+            self.actor.init(controller.actor),  # pyright: ignore[reportArgumentType]
+            self.critics.init(controller.critics),  # pyright: ignore[reportArgumentType]
+            self.alpha.init(controller.log_alpha),
+        )
+
+
+def init_controller(
+    key: Key[Array, ""],
+    belief: int,
+    action: int,
+    policy_layers: tuple[int, ...],
+    value_layers: tuple[int, ...],
+    alpha: float,
+) -> Controller:
+    """A new controller for beliefs and actions of these sizes; Q̄ starts as Q, α at `alpha`, u at 1."""
+    critic = MLP((belief + action, *value_layers, 1), jax.nn.relu)
+    actor, critics = draw(key, (Actor(belief, action, policy_layers), (critic, critic)))
+    unit = Unit(jnp.ones(()), jnp.zeros(()))
+    return Controller(actor, critics, jax.tree.map(jnp.copy, critics), jnp.full((), math.log(alpha)), unit)
+
+
+def least(
+    critics: tuple[MLP, MLP], belief: Float[Array, "batch belief"], action: Float[Array, "batch action"]
+) -> Float[Array, " batch"]:
+    """min_i Q_i(s, a) / u."""
+    return jnp.minimum(*(q_value(critic, belief, action) for critic in critics))
+
+
+def sample(
+    actor: Actor, belief: Float[Array, "batch belief"], key: Key[Array, ""]
+) -> tuple[Float[Array, "batch action"], Float[Array, " batch"], Float[Array, "batch action"]]:
+    """ã, log π(ã|s) and μ."""
+    mean, log_sigma = jax.vmap(actor)(belief)
+    action, log_prob = jax.vmap(tanh_gaussian)(mean, log_sigma, jax.random.normal(key, mean.shape))
+    return action, log_prob, mean
+
+
+def target(controller: Controller, batch: Batch, key: Key[Array, ""]) -> Float[Array, " batch"]:
+    """y."""
+    action, _, _ = sample(controller.actor, batch.next_belief, key)
+    after = controller.unit.u * least(controller.targets, batch.next_belief, action)
+    return batch.reward + batch.discount * jnp.where(batch.terminated, 0.0, after)
+
+
+def rescale(controller: Controller, y: Float[Array, " batch"], valid: Bool[Array, " batch"]) -> Controller:
+    """The controller with the targets of one more batch in u, and the same Q."""
+    old = controller.unit
+    rate = jnp.maximum(1 / (old.batches + 1), UNIT_RATE)
+    new = Unit(old.square + rate * (valid_mean(y**2, valid) - old.square), old.batches + 1)
+
+    def rescaled(critic: MLP) -> MLP:
+        return eqx.tree_at(
+            lambda critic: critic.layers[-1], critic, replace_fn=lambda last: jax.tree.map(by_ratio, last)
+        )
+
+    def by_ratio(leaf: Array) -> Array:
+        return leaf * (old.u / new.u)
+
+    critics, targets = tuple(map(rescaled, controller.critics)), tuple(map(rescaled, controller.targets))
+    return controller._replace(critics=critics, targets=targets, unit=new)
+
+
+def q_loss(
+    critics: tuple[MLP, MLP], batch: Batch, y: Float[Array, " batch"], unit: Float[Array, ""]
+) -> Float[Array, ""]:
+    """J_Q of both critics, summed."""
+    errors = [q_value(critic, batch.belief, batch.action) - y / unit for critic in critics]
+    return valid_mean(0.5 * errors[0] ** 2 + 0.5 * errors[1] ** 2, batch.valid)
+
+
+def actor_loss(
+    actor: Actor, controller: Controller, batch: Batch, key: Key[Array, ""], regulariser: float
+) -> tuple[Float[Array, ""], tuple[Float[Array, " batch"], Float[Array, " batch"]]]:
+    """J_π; beside it min_i Q_i(s, ã) / u and log π(ã|s)."""
+    action, log_prob, mean = sample(actor, batch.belief, key)
+    q = least(controller.critics, batch.belief, action)
+    size = 0.5 * regulariser * jnp.mean(mean**2, axis=-1)
+    return valid_mean(jnp.exp(controller.log_alpha) * log_prob - q + size, batch.valid), (q, log_prob)
+
+
+def update(
+    optimisers: Optimisers,
+    state: OptimiserState,
+    controller: Controller,
+    batch: Batch,
+    key: Key[Array, ""],
+    tau: float,
+    regulariser: float,
+    target_entropy: float | None = None,
+) -> tuple[Controller, OptimiserState, dict[str, Float[Array, ""]]]:
+    """One step of every optimiser, then of Q̄ towards the new Q; `target_entropy` None is minus the actions."""
+    key_target, key_actor = jax.random.split(key)
+    y = target(controller, batch, key_target)
+    controller = rescale(controller, y, batch.valid)
+    j_q, grad_critics = jax.value_and_grad(q_loss)(controller.critics, batch, y, controller.unit.u)
+    differentiate = jax.value_and_grad(actor_loss, has_aux=True)
+    (j_pi, (q, log_prob)), grad_actor = differentiate(controller.actor, controller, batch, key_actor, regulariser)
+    entropy = -float(batch.action.shape[-1]) if target_entropy is None else target_entropy
+    grad_alpha = jax.grad(alpha_loss)(controller.log_alpha, log_prob, batch.valid, entropy)
+    actor, s_actor = descend(optimisers.actor, grad_actor, state.actor, controller.actor)
+    critics, s_critics = descend(optimisers.critics, grad_critics, state.critics, controller.critics)
+    log_alpha, s_alpha = descend(optimisers.alpha, grad_alpha, state.alpha, controller.log_alpha)
+    metrics = {
+        "loss_q": j_q,
+        "loss_actor": j_pi,
+        "alpha": jnp.exp(controller.log_alpha),
+        "entropy": -valid_mean(log_prob, batch.valid),
+        "q": valid_mean(q, batch.valid) * controller.unit.u,
+        "unit": controller.unit.u,
+    }
+    targets = soft_update(controller.targets, critics, tau)
+    return (
+        Controller(actor, critics, targets, log_alpha, controller.unit),
+        OptimiserState(s_actor, s_critics, s_alpha),
+        metrics,
+    )

@@ -1,0 +1,77 @@
+"""A recurrent model that learns only to predict; its state is the belief of `predictive-sac`.
+
+With x_t = (o_t, a_{t-1}, r_{t-1}), observations and rewards in standardised units:
+
+    h_t                  = LSTM(h_{t-1}; x_t)
+    prediction           = MLP[h_t, a_t]
+    J_model              = E ‖prediction - (o_{t+1}, r_t)‖²,  mean over the entries
+
+What h_t must hold to predict is what the history says of the hidden state. Some cells begin with a long memory: their
+forget gates' biases are log U(1, T), so that they forget over up to T steps (Tallec and Ollivier 2018, "chrono
+initialisation"). An LSTM that begins as usual forgets an event within some tens of steps and does not learn otherwise
+from predictions one step ahead.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Key
+
+from beliefrl.models.nets import LSTM, MLP, LSTMState, draw
+from beliefrl.models.soft_actor_critic import valid_mean
+
+
+class PredictiveModel(eqx.Module):
+    """The weights of an LSTM and of the perceptron that predicts from its state."""
+
+    lstm: LSTM
+    predictor: MLP
+
+    def __init__(self, obs: int, action: int, d: int, hidden: int):
+        """Sizes of observations, actions, the LSTM's state and the predictor's hidden layer."""
+        self.lstm = LSTM(obs + action + 1, d)
+        self.predictor = MLP((d + action, hidden, obs + 1), jax.nn.relu)
+
+    def unroll(
+        self, x: Float[Array, "time batch x"], is_first: Bool[Array, "time batch"], burn_in: int
+    ) -> Float[Array, "kept batch d"]:
+        """h_t from the end of the burn-in on, which begins with an empty state and takes no gradient."""
+        start = self.lstm.start(x.shape[1])
+        if burn_in:
+            burnt_in = jax.lax.stop_gradient(self.lstm).unroll(start, x[:burn_in], is_first[:burn_in])
+            start = jax.tree.map(lambda leaf: leaf[-1], burnt_in)
+        return self.lstm.unroll(start, x[burn_in:], is_first[burn_in:]).d
+
+    def next_state(self, state: LSTMState, x: Float[Array, " x"], is_first: Bool[Array, ""]) -> LSTMState:
+        """The LSTM's state after x_t."""
+        start = jax.tree.map(lambda leaf: leaf[None], state)
+        after = self.lstm.unroll(start, x[None, None], is_first[None, None])
+        return jax.tree.map(lambda leaf: leaf[0, 0], after)
+
+    def predict(self, d: Float[Array, " d"], action: Float[Array, " action"]) -> Float[Array, " prediction"]:
+        """(o_{t+1}, r_t) in standardised units, given h_t and a_t."""
+        return self.predictor(jnp.concatenate([d, action]))
+
+
+def init_model(
+    key: Key[Array, ""], obs: int, action: int, d: int, hidden: int, long_memories: float, longest_memory: int
+) -> PredictiveModel:
+    """A new model; the fraction `long_memories` of its cells forgets over 1 to `longest_memory` steps."""
+    key_weights, key_memories = jax.random.split(key)
+    model = draw(key_weights, PredictiveModel(obs, action, d, hidden))
+    cells = round(long_memories * d)
+    steps = jax.random.uniform(key_memories, (cells,), minval=1.0, maxval=float(longest_memory))
+    bias = model.lstm.bias.at[d : d + cells].set(jnp.log(steps))  # gates i, f, g, o
+    return eqx.tree_at(lambda model: model.lstm.bias, model, bias)
+
+
+def prediction_loss(
+    model: PredictiveModel,
+    d: Float[Array, "time batch d"],
+    action: Float[Array, "length batch action"],
+    target: Float[Array, "length batch prediction"],
+    valid: Bool[Array, "length batch"],
+) -> Float[Array, ""]:
+    """J_model of the transitions that begin at all timesteps but the last; mean over the valid ones."""
+    predicted = jax.vmap(jax.vmap(model.predict))(d[:-1], action)
+    return valid_mean(jnp.mean((predicted - target) ** 2, axis=-1).ravel(), valid.ravel())

@@ -1,0 +1,121 @@
+"""Predictive SAC: beliefs and transitions in time, where gradients go, the pool."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from agents.moments import SPEC, changed_where_missing, same, windows
+from beliefrl.agents.predictive_sac import PredictiveSACAgent, draw
+from beliefrl.models.nets import standardise
+from beliefrl.types import UserError
+
+AGENT = PredictiveSACAgent(
+    policy_layers=(8,),
+    value_layers=(8,),
+    d_size=8,
+    hidden_size=8,
+    seq_len=6,
+    sequences=2,
+    burn_in=4,
+    batch_size=16,
+    pool=3,
+)
+TIME, COUNT = 11, 12  # timesteps of a window, transitions of a cycle
+
+
+@pytest.fixture(scope="module")
+def state():
+    return jax.jit(lambda key: AGENT.init(key, SPEC))(jax.random.key(0))
+
+
+@pytest.fixture(scope="module")
+def begun(state):
+    """The state after a cycle was begun on some windows, those windows, and the batches."""
+    window = windows(jax.random.key(1), 2, TIME)
+    return *jax.jit(AGENT.begin_cycle)(state, window, jax.random.key(2))[:2], window
+
+
+def test_acting_forms_the_belief_that_replay_forms(state):
+    first = jnp.zeros((1, TIME), bool).at[0, jnp.array([0, 5])].set(True)
+    step = windows(jax.random.key(1), 1, TIME, first).step
+    at_once = jax.jit(lambda: state.model.unroll(AGENT.perception(state.scales, step), step.is_first, 4))()
+    memory, act = AGENT.reset(SPEC), jax.jit(AGENT.act)
+    for t in range(TIME):
+        now = jax.tree.map(lambda leaf, t=t: leaf[t, 0], step)
+        _, memory = act(state, memory, now, jax.random.key(t), jnp.array(False))
+        if t >= 4:
+            np.testing.assert_allclose(memory.d, at_once[t - 4, 0], rtol=1e-5, atol=1e-6)
+
+
+def test_transitions_in_the_pool_are_aligned_in_time(state, begun):
+    after, _, window = begun
+    pool, step = jax.tree.map(lambda leaf: leaf[0], after.pool.transitions), window.step
+    x = AGENT.perception(after.scales, step)  # the scales of this cycle, the model before its update
+    belief = jnp.concatenate([state.model.unroll(x, step.is_first, 4), x[4:]], axis=-1)
+    for t, sequence in ((0, 0), (2, 1), (5, 1)):
+        row, now, m = 2 * t + sequence, 4 + t, min(AGENT.n_step, 6 - t)
+        np.testing.assert_allclose(pool.belief[row], belief[t, sequence], rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(pool.next_belief[row], belief[t + m, sequence], rtol=1e-4, atol=1e-5)
+        np.testing.assert_array_equal(pool.action[row], step.prev_action[now + 1, sequence])
+        rewards = [0.995**k * float(step.reward[now + 1 + k, sequence]) for k in range(m)]
+        np.testing.assert_allclose(pool.reward[row], sum(rewards), rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(pool.discount[row], 0.995**m, rtol=1e-5)
+
+
+def test_a_batch_is_standardised_and_drawn_from_all_cycles_in_the_pool(state, begun):
+    after, batches, _ = begun
+    assert batches.reward.shape == (1, 16)
+    raw = draw(after.pool, jax.random.key(2), (1, 16))
+    np.testing.assert_allclose(batches.belief, standardise(after.scales.belief, raw.belief), rtol=1e-5, atol=1e-6)
+
+    begin, seen = jax.jit(AGENT.begin_cycle), after
+    for number in range(4):  # the pool has room for three cycles
+        seen, _, _ = begin(seen, windows(jax.random.key(10 + number), 2, TIME), jax.random.key(number))
+        cycles = min(number + 2, 3)
+        stored = set(np.asarray(seen.pool.transitions.reward)[:cycles].ravel().tolist())
+        drawn = set(np.asarray(draw(seen.pool, jax.random.key(3), (8, 64)).reward).ravel().tolist())
+        assert drawn == stored
+    assert not set(np.asarray(after.pool.transitions.reward[0]).tolist()) & stored  # the first cycle was replaced
+
+
+def test_the_controller_sends_no_gradient_into_the_model(state, begun):
+    after, batches, _ = begun
+    learned, _ = jax.jit(AGENT.update)(after, jax.tree.map(lambda leaf: leaf[0], batches), jax.random.key(4))
+    assert same(learned.model, after.model)
+    assert not same(after.model, state.model)
+    assert not same(learned.controller.actor, after.controller.actor)
+
+
+def test_pretraining_teaches_the_model_to_predict(state):
+    """Of a world in which the next observation is the action before and the reward is an entry of it."""
+    window = windows(jax.random.key(1), 2, TIME)
+    step = window.step
+    action = step.prev_action
+    obs = jnp.concatenate([jnp.zeros((1, 2, 3)), action[:-1, :, jnp.array([0, 1, 0])]])
+    window = window._replace(step=step._replace(obs=obs, reward=obs[..., 1]))
+    learn = jax.jit(dataclasses.replace(AGENT, lr_model=1e-2).pretrain)
+    losses = []
+    for number in range(200):
+        state, metrics = learn(state, window, jax.random.key(number))
+        losses.append(float(metrics["loss_model"]))
+    assert losses[-1] < 0.1 * losses[0]
+
+
+def test_what_does_not_exist_changes_nothing(state):
+    exists = jnp.ones((2, TIME), bool).at[0, :3].set(False).at[1, -2:].set(False)
+    first = jnp.zeros((2, TIME), bool).at[0, 3].set(True).at[1, 0].set(True)  # as the replay marks the oldest timestep
+    results = changed_where_missing(AGENT, state, windows(jax.random.key(1), 2, TIME, first), exists)
+    (a, metrics_a), (b, metrics_b) = results
+    for x, y in ((a.model, b.model), (a.controller, b.controller), (metrics_a, metrics_b)):
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-6), x, y)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("pool", 0), ("long_memories", 1.5), ("n_step", 0), ("alpha_start", -1.0)]
+)
+def test_impossible_values_are_refused(field, value):
+    with pytest.raises(UserError, match=f"{field}={value} is impossible"):
+        PredictiveSACAgent(**{field: value})
