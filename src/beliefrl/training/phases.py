@@ -90,7 +90,8 @@ def explore(
     """Environment steps `first` to `first + steps` without updates; at most `stretch_length` of them."""
 
     def step(i, carry):
-        return jax.vmap(partial(_act, agent, task), in_axes=(0, 0, None, None))(*carry, first + i, i)
+        seeds, log = carry
+        return jax.vmap(partial(_act, agent, task), in_axes=(0, 0, None, None))(seeds, log, first + i, i)
 
     seeds, log = jax.lax.fori_loop(0, steps, step, (seeds, _no_episodes(agent, seeds)))
     return seeds, Stretch({}, log)
@@ -168,7 +169,8 @@ def _cycle(
     """
 
     def act(step, carry):
-        return _act(agent, task, *carry, step, index + step - first)
+        seed, log = carry
+        return _act(agent, task, seed, log, step, index + step - first)
 
     seed, log = jax.lax.fori_loop(first, first + agent.cycle, act, (seed, log))
     state, metrics = learn_cycle(agent, seed, first)
