@@ -38,8 +38,8 @@ def main(name: str = "vrm", steps: int = 2_000, capacity: int = 200_000, rounds:
             before = time.perf_counter()
             if number % 2:
                 replay = seeds.replay
-                rest = seeds._replace(replay=replay._replace(moments=()))
-                checkpoints.save(first, {}, rest, replay.moments, np.asarray(replay.added))
+                rest = seeds._replace(replay=replay._replace(timesteps=()))
+                checkpoints.save(first, {}, rest, replay.timesteps, np.asarray(replay.added))
                 waited.append(time.perf_counter() - before)
             for step in range(first, first + steps, every):
                 seeds = jax.block_until_ready(program.learn(seeds, step, every // agent.cycle)[0])

@@ -17,7 +17,7 @@ def main() -> None:
         agent, task = make_agent(name), Noise(6, 3)
         capacity = schedule.capacity(agent, Options(steps=STEPS))
         seed = phases.begin(agent, task, capacity, jax.random.key(0))
-        ring = sum(leaf.nbytes for leaf in jax.tree.leaves(seed.replay.moments))
+        ring = sum(leaf.nbytes for leaf in jax.tree.leaves(seed.replay.timesteps))
         data = ring / capacity * (STEPS + STEPS // EPISODE)
         print(f"{name}: {ring / 1e9:.2f} GB for {data / 1e9:.2f} GB of data, ratio {ring / data:.2f}")
 

@@ -103,10 +103,10 @@ class CountingState(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class CountingAgent:
-    """Counts the moments it perceives, notes the count, and checks every window that it is given.
+    """Counts the timesteps it perceives, notes the count, and checks every window that it is given.
 
     `broken` counts what contradicts: an observation that is not the count, a note that is not the observation, a
-    transition whose parts are not one moment apart, a terminal moment followed by anything.
+    transition whose parts are not one timestep apart, a terminal timestep followed by anything.
     """
 
     step_start_rl: int = 10

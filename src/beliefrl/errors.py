@@ -7,7 +7,7 @@ ESCAPES = re.compile(r"(?:\x1b\[|\x9b)[0-?]*[ -/]*[@-~]|\x1b\].*?(?:\x07|\x1b\\)
 
 
 class UserError(Exception):
-    """A mistake that the user can mend. Its message is one sentence: what was wrong, and what to do."""
+    """A mistake that the user can fix. Its message is one sentence: what was wrong, and what to do."""
 
 
 class UsageError(Exception):

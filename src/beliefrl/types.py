@@ -1,6 +1,6 @@
-"""The words that the whole library shares: a moment, a window of moments, a task's sizes, a user's mistake.
+"""The words that the whole library shares: a timestep, a window of timesteps, a task's sizes, a user's mistake.
 
-Axis names in shapes, everywhere: `seed` (one training each), `batch` (windows), `time` (moments of a window),
+Axis names in shapes, everywhere: `seed` (one training each), `batch` (windows), `time` (timesteps of a window),
 `obs`, `action`, `belief` (what the controller reads), `d` (recurrent state), `z` (latent variable), `x` (perception).
 """
 
@@ -91,15 +91,15 @@ class Spec(NamedTuple):
 
 
 class Timestep(NamedTuple):
-    """One moment: what is perceived at t, and what was done just before it.
+    """One timestep: what is perceived at t, and what was done just before it.
 
-    Two neighbouring moments are a transition (o_t, a_t, r_t, o_{t+1}) unless the second is_first:
-    a_t is the second's prev_action, r_t its reward. An episode's last observation is a moment too.
+    Two neighbouring timesteps are a transition (o_t, a_t, r_t, o_{t+1}) unless the second is_first:
+    a_t is the second's prev_action, r_t its reward. An episode's last observation is a timestep too.
     """
 
     obs: Float[Array, "*batch obs"]  # o_t
-    reward: Float[Array, "*batch"]  # r_{t-1}, which came with o_t; 0 at the first moment
-    prev_action: Float[Array, "*batch action"]  # a_{t-1} in [-1, 1]; zeros at the first moment
+    reward: Float[Array, "*batch"]  # r_{t-1}, which came with o_t; 0 at the first timestep
+    prev_action: Float[Array, "*batch action"]  # a_{t-1} in [-1, 1]; zeros at the first timestep
     is_first: Bool[Array, "*batch"]  # an episode begins here: the memory is empty
     terminated: Bool[Array, "*batch"]  # o_t is terminal: there is no value beyond it
 
@@ -110,26 +110,26 @@ def perception(step: Timestep) -> Float[Array, "*batch x"]:
 
 
 class StoredTimestep(NamedTuple):
-    """What the replay keeps of a moment: the step, and the agent's own note of it (any pytree, may be empty)."""
+    """What the replay keeps of a timestep: the step, and the agent's own note of it (any pytree, may be empty)."""
 
     step: Timestep
     note: Any
 
 
 class Window(NamedTuple):
-    """Windows of consecutive moments as the replay returns them; is_first is also set at the oldest stored moment."""
+    """Windows of consecutive timesteps as the replay returns them; is_first is also set at the oldest one stored."""
 
     step: Timestep  # leaves (time, batch, ...)
     note: Any
     exists: Bool[Array, "time *batch"]  # False where the window overhangs what is stored
 
     def between(self, start: int, stop: int | None) -> "Window":
-        """The moments from `start` to `stop`, as slices count them."""
+        """The timesteps from `start` to `stop`, as slices count them."""
         return jax.tree.map(lambda leaf: leaf[start:stop], self)
 
 
 class WindowShape(NamedTuple):
-    """How an agent wants to sample: `burn_in` moments, then `length` transitions (so burn_in + length + 1 moments)."""
+    """How an agent samples: `burn_in` timesteps, then `length` transitions, so burn_in + length + 1 timesteps."""
 
     burn_in: int
     length: int

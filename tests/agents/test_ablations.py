@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from agents.moments import SMALL, SPEC, along, random_like, same, slope, windows
+from agents.random_windows import SMALL, SPEC, along, random_like, same, slope, windows
 from beliefrl import agents
 from beliefrl.types import UserError, perception
 
@@ -71,8 +71,8 @@ def deterministic():
 def test_a_deterministic_model_predicts_before_it_sees(deterministic):
     """z_t and the prediction of x_t come from d_{t-1} and a_{t-1}; x_t enters d_t. No key changes anything."""
     _, state, window = deterministic
-    moments = window
-    changed = moments.step._replace(obs=moments.step.obs.at[5].add(1.0))
+    timesteps = window
+    changed = timesteps.step._replace(obs=timesteps.step.obs.at[5].add(1.0))
 
     @jax.jit
     def infer(step, key):
@@ -80,7 +80,7 @@ def test_a_deterministic_model_predicts_before_it_sees(deterministic):
         noise = jax.random.normal(key, (*step.reward.shape, 4))
         return vrm.infer(vrm.start(noise.shape[1]), perception(step), step.prev_action, step.is_first, noise)
 
-    one, other = infer(moments.step, jax.random.key(1)), infer(changed, jax.random.key(2))
+    one, other = infer(timesteps.step, jax.random.key(1)), infer(changed, jax.random.key(2))
     np.testing.assert_allclose(one.z[:6], other.z[:6], rtol=1e-6)
     np.testing.assert_allclose(one.state.d[:5], other.state.d[:5], rtol=1e-6)
     assert not np.allclose(one.state.d[5], other.state.d[5])
@@ -90,8 +90,8 @@ def test_a_deterministic_model_predicts_before_it_sees(deterministic):
 def test_a_deterministic_models_loss_is_its_mean_squared_error(deterministic):
     agent, state, window = deterministic
     window = jax.tree.map(lambda leaf: leaf[:, :2], window)
-    vrm, moments = state.keep, window.between(0, -1)
-    step = moments.step
+    vrm, timesteps = state.keep, window.between(0, -1)
+    step = timesteps.step
 
     @jax.jit
     def predicted():

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from agents.moments import SPEC, changed_where_missing, same, windows
+from agents.random_windows import SPEC, changed_where_missing, same, windows
 from beliefrl.agents.predictive_sac import PredictiveSACAgent, draw
 from beliefrl.models.nets import standardise
 from beliefrl.types import UserError

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from agents.moments import SPEC, along, changed_where_missing, differ, random_like, slope, windows
+from agents.random_windows import SPEC, along, changed_where_missing, differ, random_like, slope, windows
 from beliefrl.agents.sac_lstm import SACLSTMAgent
 from beliefrl.models.nets import LSTM, draw
 from beliefrl.models.soft_actor_critic import actor_loss, q_loss, state_value, value_loss
@@ -48,8 +48,8 @@ def test_acting_forms_the_belief_that_replay_forms(state):
     at_once = jax.jit(lambda: state.lstm.unroll(state.lstm.start(1), AGENT.perception(step), step.is_first))()
     memory, act = AGENT.reset(SPEC), jax.jit(AGENT.act)
     for t in range(TIME):
-        moment = jax.tree.map(lambda leaf, t=t: leaf[t, 0], window.step)
-        _, memory = act(state, memory, moment, jax.random.key(t), jnp.array(False))
+        timestep = jax.tree.map(lambda leaf, t=t: leaf[t, 0], window.step)
+        _, memory = act(state, memory, timestep, jax.random.key(t), jnp.array(False))
         np.testing.assert_allclose(memory.d, at_once.d[t, 0], rtol=1e-5, atol=1e-6)
 
 
@@ -142,7 +142,7 @@ def test_an_update_trains_everything_and_the_targets_follow_slowly(state):
     assert differ(after.controller._replace(target_value=0), state.controller._replace(target_value=1))
 
 
-def test_moments_that_do_not_exist_enter_no_loss(state):
+def test_timesteps_that_do_not_exist_enter_no_loss(state):
     exists = jnp.ones((2, TIME), bool).at[:, 8:].set(False)
     results = changed_where_missing(AGENT, state, windows(jax.random.key(1), 2, TIME), exists)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), *results)

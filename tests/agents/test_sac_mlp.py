@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from agents.moments import SPEC, differ, windows
+from agents.random_windows import SPEC, differ, windows
 from beliefrl.agents.sac_mlp import SACMLPAgent
 from beliefrl.types import Timestep, UserError, Window
 
@@ -27,12 +27,12 @@ def state():
 
 
 def test_its_transitions_are_those_of_the_golden_update():
-    """The authors' numbers as windows of two moments come out as the transitions that `test_golden` learns from."""
+    """The authors' numbers as windows of two timesteps come out as the transitions that `test_golden` learns from."""
     numbers = dict(np.load(GOLDEN))
-    moments = [numbers["belief"], numbers["next_belief"]]
+    timesteps = [numbers["belief"], numbers["next_belief"]]
     rows, actions = len(numbers["reward"]), numbers["action"].shape[-1]
     step = Timestep(
-        obs=jnp.stack(moments, axis=1),
+        obs=jnp.stack(timesteps, axis=1),
         reward=jnp.stack([jnp.zeros(rows), numbers["reward"]], axis=1),
         prev_action=jnp.stack([jnp.zeros((rows, actions)), numbers["action"]], axis=1),
         is_first=jnp.zeros((rows, 2), bool).at[:, 0].set(True),

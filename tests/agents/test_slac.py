@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from agents.moments import SPEC, along, changed_where_missing, differ, random_like, same, slope, windows
+from agents.random_windows import SPEC, along, changed_where_missing, differ, random_like, same, slope, windows
 from beliefrl.agents.slac import SLACAgent, begin_windows
 from beliefrl.models.latent_model import elbo_terms
 from beliefrl.types import UserError, perception
@@ -43,8 +43,8 @@ def log_prob(x, mean, sigma):
 
 
 @pytest.fixture(scope="module")
-def moments():
-    """Six moments of two windows, with an episode that begins in the second."""
+def timesteps():
+    """Six timesteps of two windows, with an episode that begins in the second."""
     is_first = jnp.zeros((2, 6), bool).at[:, 0].set(True).at[1, 3].set(True)
     return begin_windows(windows(jax.random.key(1), 2, 6, is_first))
 
@@ -54,8 +54,8 @@ def noise():
     return tuple(jax.random.normal(jax.random.key(size), (6, 2, size)) for size in (AGENT.z1_size, AGENT.z2_size))
 
 
-def test_inference_and_elbo_are_the_equations(state, moments, noise):
-    model, step = state.model, moments.step
+def test_inference_and_elbo_are_the_equations(state, timesteps, noise):
+    model, step = state.model, timesteps.step
 
     @jax.jit
     def ours():
@@ -119,8 +119,8 @@ def test_the_actor_learns_on_what_it_read(state, begins):
     learned = jax.jit(AGENT.histories)(window.step)
     memory, act = AGENT.reset(SPEC), jax.jit(AGENT.act)
     for t in range(TIME):
-        moment = jax.tree.map(lambda leaf, t=t: leaf[t, 0], window.step)
-        _, memory = act(state, memory, moment, jax.random.key(t), jnp.array(True))
+        timestep = jax.tree.map(lambda leaf, t=t: leaf[t, 0], window.step)
+        _, memory = act(state, memory, timestep, jax.random.key(t), jnp.array(True))
         if t >= AGENT.history - 1:
             np.testing.assert_array_equal(learned[t - AGENT.history + 1, 0], memory.ravel())
 
@@ -140,7 +140,7 @@ def test_batches_are_aligned_in_time(state):
 
 
 @pytest.mark.slow
-def test_moments_that_do_not_exist_enter_no_loss(state):
+def test_timesteps_that_do_not_exist_enter_no_loss(state):
     exists = jnp.ones((4, TIME), bool).at[:, 6:].set(False)
     results = changed_where_missing(AGENT, state, windows(jax.random.key(1), 4, TIME), exists)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), *results)

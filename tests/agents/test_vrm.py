@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from agents.moments import SMALL, SPEC, differ, same
+from agents.random_windows import SMALL, SPEC, differ, same
 from beliefrl import agents
 from beliefrl.agents.vrm import VRMAgent
 from beliefrl.models.nets import initial_statistics, standardise
@@ -111,9 +111,9 @@ def test_pretraining_trains_the_first_impression_model_alone(state):
 
 @jax.jit
 def infer(vrm, window, noise):
-    moments = window
-    x = jnp.concatenate([moments.step.obs, moments.step.reward[..., None]], axis=-1)
-    return vrm.infer(vrm.start(noise.shape[1]), x, moments.step.prev_action, moments.step.is_first, noise)
+    timesteps = window
+    x = jnp.concatenate([timesteps.step.obs, timesteps.step.reward[..., None]], axis=-1)
+    return vrm.infer(vrm.start(noise.shape[1]), x, timesteps.step.prev_action, timesteps.step.is_first, noise)
 
 
 def test_an_episode_inside_a_window_begins_with_an_empty_memory(state):
@@ -130,18 +130,18 @@ def test_an_episode_inside_a_window_begins_with_an_empty_memory(state):
 def test_the_burn_in_and_the_sequence_are_one_unroll(state):
     window = windows(jax.random.key(1), 3)
     noise = jax.random.normal(jax.random.key(2), (11, 3, AGENT.z_size))
-    moments = window
-    x = jnp.concatenate([moments.step.obs, moments.step.reward[..., None]], axis=-1)
+    timesteps = window
+    x = jnp.concatenate([timesteps.step.obs, timesteps.step.reward[..., None]], axis=-1)
     whole = infer(state.keep, window, noise)
     start = jax.tree.map(lambda leaf: leaf[3], whole.state)
     rest = jax.jit(VRM.infer)(
-        state.keep, start, x[4:], moments.step.prev_action[4:], moments.step.is_first[4:], noise[4:]
+        state.keep, start, x[4:], timesteps.step.prev_action[4:], timesteps.step.is_first[4:], noise[4:]
     )
     np.testing.assert_allclose(rest.state.d, whole.state.d[4:], rtol=1e-5, atol=1e-6)
 
 
 def test_acting_forms_the_belief_that_replay_forms(state):
-    """Moment by moment as an actor and at once as the replay: the same d, with the same z."""
+    """Moment by timestep as an actor and at once as the replay: the same d, with the same z."""
     window = windows(jax.random.key(1), 1)
     at_once = infer(state.keep, window, jnp.zeros((11, 1, AGENT.z_size)))
     memory, mode, act = AGENT.reset(SPEC), jnp.array(False), jax.jit(AGENT.act)
@@ -180,7 +180,7 @@ def test_batches_are_aligned_in_time(state):
 
 
 @pytest.mark.slow
-def test_moments_that_do_not_exist_enter_no_loss(state):
+def test_timesteps_that_do_not_exist_enter_no_loss(state):
     exists = jnp.ones((12, 11), bool).at[:, 8:].set(False)
     here = windows(jax.random.key(1), 12, exists=exists)
     other = windows(jax.random.key(9), 12, exists=exists)
@@ -203,8 +203,8 @@ def test_a_recomputed_first_impression_is_the_stored_one_up_to_its_sample(state)
     recompute = dataclasses.replace(AGENT, store_first_impression=False)
     window = windows(jax.random.key(1), 10)
     key_first, _ = jax.random.split(jax.random.key(2))
-    moments = window
-    d_first = jax.jit(AGENT.unroll)(state.first, moments, AGENT.noise(key_first, moments)).d
+    timesteps = window
+    d_first = jax.jit(AGENT.unroll)(state.first, timesteps, AGENT.noise(key_first, timesteps)).d
     stored = jax.jit(AGENT.batches)(state, window._replace(note=(d_first,)), jax.random.key(2))
     again = jax.jit(recompute.batches)(state, window._replace(note=()), jax.random.key(2))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), stored, again)

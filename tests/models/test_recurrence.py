@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from agents.moments import random_like
+from agents.random_windows import random_like
 from beliefrl.models import latent_model, nets, variational_model
 from beliefrl.models.nets import LSTMState
 from beliefrl.models.recurrence import unroll

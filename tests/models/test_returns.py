@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.moments import SMALL, SPEC, windows
+from agents.random_windows import SMALL, SPEC, windows
 from beliefrl import agents
 from beliefrl.models.returns import n_step_returns, transition_batch
 from beliefrl.types import Timestep
@@ -21,7 +21,7 @@ def step_of(rewards, firsts, terminated):
 
 
 def plainly(rewards, firsts, terminated, first, n):
-    """The return that begins at one moment, by walking."""
+    """The return that begins at one timestep, by walking."""
     total, now = 0.0, first
     while now - first < n and now + 1 < len(rewards) and not firsts[now + 1] and not terminated[now]:
         total += GAMMA ** (now - first) * rewards[now + 1]
@@ -30,7 +30,7 @@ def plainly(rewards, firsts, terminated, first, n):
 
 
 jitted_returns = jax.jit(n_step_returns, static_argnums=(2, 3))
-moments = st.sampled_from([3, 10]).flatmap(
+timesteps = st.sampled_from([3, 10]).flatmap(
     lambda count: st.tuples(
         st.lists(st.floats(-2, 2, width=32), min_size=count, max_size=count),
         st.lists(st.booleans(), min_size=count, max_size=count),
@@ -40,7 +40,7 @@ moments = st.sampled_from([3, 10]).flatmap(
 
 
 @settings(deadline=None, max_examples=40)
-@given(moments, st.sampled_from([1, 2, 3, 5, 20]))
+@given(timesteps, st.sampled_from([1, 2, 3, 5, 20]))
 def test_returns_are_those_of_walking_along_the_episode(given_moments, n):
     rewards, firsts, ends = given_moments
     terminated = [end and i + 1 < len(firsts) and firsts[i + 1] for i, end in enumerate(ends)]
@@ -55,7 +55,7 @@ def test_returns_are_those_of_walking_along_the_episode(given_moments, n):
         np.testing.assert_allclose(returns.discount[first, 0], discount, rtol=1e-6)
 
 
-def test_a_truncated_episode_bootstraps_from_its_last_moment_and_a_terminated_one_does_not():
+def test_a_truncated_episode_bootstraps_from_its_last_timestep_and_a_terminated_one_does_not():
     firsts = [True, False, False, True, False, False]
     step = step_of([0, 1, 1, 0, 1, 1], firsts, [False, False, False, False, False, True])
     beliefs = 10 * step.obs

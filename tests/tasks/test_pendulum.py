@@ -20,12 +20,12 @@ def episodes(task, policy):
     """States before each step, actions, and what the step gave; every array (episode, time, ...)."""
 
     def one(key):
-        def moment(state, key):
+        def timestep(state, key):
             action = policy(state, key)
             after, obs, reward, terminated = task.step(state, action, key)
             return after, (jnp.stack(state), action, obs, reward, terminated)
 
-        return jax.lax.scan(moment, task.reset(key)[0], jax.random.split(key, 200))[1]
+        return jax.lax.scan(timestep, task.reset(key)[0], jax.random.split(key, 200))[1]
 
     return [np.asarray(x) for x in jax.jit(jax.vmap(one))(KEYS)]
 

@@ -48,12 +48,12 @@ def episodes(policy):
     """States before and after each step, actions, and what the step gave; every array (episode, time, ...)."""
 
     def one(start, key):
-        def moment(state, key):
+        def timestep(state, key):
             action = policy(state, key)
             after, obs, reward, terminated = TASK.step(state, action, key)
             return after, (state, after, action, obs, reward, terminated)
 
-        return jax.lax.scan(moment, start, jax.random.split(key, 128))[1]
+        return jax.lax.scan(timestep, start, jax.random.split(key, 128))[1]
 
     return jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(STARTS(KEYS)[0], KEYS))
 

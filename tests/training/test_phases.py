@@ -143,7 +143,7 @@ def test_steps_are_counted_as_environment_steps():
     program = phases.compile_program(agent, task, capacity=90, episodes=2)
     seeds = program.begin(jax.random.split(jax.random.key(0), 1))
     seeds, stretch = program.explore(seeds, 0, 50)
-    assert int(seeds.replay.added[0]) == 50 + 50 // 7  # every end of an episode is one moment more
+    assert int(seeds.replay.added[0]) == 50 + 50 // 7  # every end of an episode is one timestep more
     assert int(stretch.episodes.done.sum()) == 50 // 7
     assert int(seeds.actor.length[0]) == 50 % 7
 

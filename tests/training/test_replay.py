@@ -10,8 +10,8 @@ from beliefrl.training import replay as ring
 from beliefrl.types import StoredTimestep, Timestep, WindowShape, transitions
 
 
-def moment(number, is_first):
-    """A moment that carries its own running number everywhere."""
+def timestep(number, is_first):
+    """A timestep that carries its own running number everywhere."""
     value = jnp.asarray(number, float)
     step = Timestep(value[None], value, value[None], jnp.asarray(is_first), jnp.array(False))
     return StoredTimestep(step, (value,))
@@ -21,13 +21,13 @@ def moment(number, is_first):
 def fill(replay, numbers, firsts, keep):
     def add(replay, inputs):
         number, first, keep = inputs
-        return ring.add(replay, moment(number, first), keep), None
+        return ring.add(replay, timestep(number, first), keep), None
 
     return jax.lax.scan(add, replay, (numbers, firsts, keep))[0]
 
 
 def filled(capacity, firsts, keep=None):
-    """A ring after these moments; the rest up to 40 is masked, so that one program serves every length."""
+    """A ring after these timesteps; the rest up to 40 is masked, so that one program serves every length."""
     keep = np.ones(len(firsts), bool) if keep is None else keep
     firsts, keep = (np.pad(np.asarray(flags, bool), (0, 40 - len(flags))) for flags in (firsts, keep))
     return fill(empty(capacity), np.arange(40), firsts, keep)
@@ -35,7 +35,7 @@ def filled(capacity, firsts, keep=None):
 
 @functools.cache
 def empty(capacity):
-    return ring.init(moment(0, False), capacity)
+    return ring.init(timestep(0, False), capacity)
 
 
 sample = jax.jit(ring.sample, static_argnums=(2, 3))
@@ -47,7 +47,7 @@ sample = jax.jit(ring.sample, static_argnums=(2, 3))
     st.sampled_from([5, 16, 64]),
     st.sampled_from([WindowShape(0, 3), WindowShape(4, 6), WindowShape(7, 20)]),
 )
-def test_windows_are_the_newest_moments_in_order(firsts, capacity, shape):
+def test_windows_are_the_newest_timesteps_in_order(firsts, capacity, shape):
     replay = filled(capacity, firsts)
     stored = np.arange(len(firsts))[-capacity:]
     window = sample(replay, jax.random.key(0), 8, shape)
@@ -78,11 +78,11 @@ def test_a_masked_addition_leaves_the_ring_alone():
     keep = np.arange(20) % 3 != 0
     replay = filled(64, np.zeros(20, bool), keep)
     assert int(replay.added) == keep.sum()
-    np.testing.assert_array_equal(replay.moments.note[0][: keep.sum()], np.arange(20)[keep])
+    np.testing.assert_array_equal(replay.timesteps.note[0][: keep.sum()], np.arange(20)[keep])
 
 
 def test_an_addition_is_masked_only_where_asked():
-    assert int(jax.jit(ring.add)(empty(8), moment(1, False)).added) == 1
+    assert int(jax.jit(ring.add)(empty(8), timestep(1, False)).added) == 1
 
 
 def test_starts_are_uniform():
@@ -101,5 +101,5 @@ def test_history_and_annotate_address_the_first_moments():
     np.testing.assert_array_equal(exists, np.arange(8) < 5)
     np.testing.assert_array_equal(steps.reward[:5], np.arange(5))
     replay = ring.annotate(replay, (jnp.arange(8.0) * 10,), 8)
-    np.testing.assert_array_equal(replay.moments.note[0][:5], np.arange(5) * 10)
-    np.testing.assert_array_equal(replay.moments.step.reward[:5], np.arange(5))
+    np.testing.assert_array_equal(replay.timesteps.note[0][:5], np.arange(5) * 10)
+    np.testing.assert_array_equal(replay.timesteps.step.reward[:5], np.arange(5))

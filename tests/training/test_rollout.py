@@ -26,48 +26,48 @@ def advanced(task, steps, key=0):
         return jax.lax.scan(step, (actor, replay), jax.random.split(key_steps, steps))
 
     (actor, replay), episodes = run(jax.random.key(key), jax.random.key(key + 1))
-    moments = jax.tree.map(lambda leaf: np.asarray(leaf)[: int(replay.added)], replay.moments)
-    return moments, jax.tree.map(np.asarray, episodes), actor
+    timesteps = jax.tree.map(lambda leaf: np.asarray(leaf)[: int(replay.added)], replay.timesteps)
+    return timesteps, jax.tree.map(np.asarray, episodes), actor
 
 
 def test_a_truncated_episode_keeps_its_last_observation_and_is_not_terminal():
-    moments, episodes, _ = advanced(Counting(max_steps=7), 21)
-    np.testing.assert_array_equal(moments.step.obs[:, 0], [*range(8)] * 3)
-    np.testing.assert_array_equal(moments.step.is_first, moments.step.obs[:, 0] == 0)
-    assert not moments.step.terminated.any()
+    timesteps, episodes, _ = advanced(Counting(max_steps=7), 21)
+    np.testing.assert_array_equal(timesteps.step.obs[:, 0], [*range(8)] * 3)
+    np.testing.assert_array_equal(timesteps.step.is_first, timesteps.step.obs[:, 0] == 0)
+    assert not timesteps.step.terminated.any()
     np.testing.assert_array_equal(np.flatnonzero(episodes.done), [6, 13, 20])
 
 
 def test_a_terminated_episode_marks_its_last_observation_only():
-    moments, episodes, _ = advanced(Counting(ends=4), 12)
-    np.testing.assert_array_equal(moments.step.obs[:, 0], [*range(5)] * 3)
-    np.testing.assert_array_equal(moments.step.terminated, moments.step.obs[:, 0] == 4)
+    timesteps, episodes, _ = advanced(Counting(ends=4), 12)
+    np.testing.assert_array_equal(timesteps.step.obs[:, 0], [*range(5)] * 3)
+    np.testing.assert_array_equal(timesteps.step.terminated, timesteps.step.obs[:, 0] == 4)
     np.testing.assert_array_equal(episodes.length[episodes.done], 4)
     np.testing.assert_array_equal(episodes.episode_return[episodes.done], 1 + 2 + 3 + 4)
 
 
 def test_termination_at_the_time_limit_is_termination():
-    moments, _, _ = advanced(Counting(ends=7, max_steps=7), 14)
-    np.testing.assert_array_equal(moments.step.terminated, moments.step.obs[:, 0] == 7)
+    timesteps, _, _ = advanced(Counting(ends=7, max_steps=7), 14)
+    np.testing.assert_array_equal(timesteps.step.terminated, timesteps.step.obs[:, 0] == 7)
 
 
 def test_the_current_timestep_is_not_in_the_replay_yet():
-    moments, _, actor = advanced(Counting(), 5)
-    np.testing.assert_array_equal(moments.step.obs[:, 0], range(5))
+    timesteps, _, actor = advanced(Counting(), 5)
+    np.testing.assert_array_equal(timesteps.step.obs[:, 0], range(5))
     assert float(actor.step.obs[0]) == 5
 
 
 def test_first_timesteps_carry_no_reward_and_no_action():
-    moments, _, _ = advanced(Counting(), 21)
-    first = moments.step.is_first
-    assert not moments.step.reward[first].any()
-    assert not moments.step.prev_action[first].any()
-    assert moments.step.prev_action[~first].all()
+    timesteps, _, _ = advanced(Counting(), 21)
+    first = timesteps.step.is_first
+    assert not timesteps.step.reward[first].any()
+    assert not timesteps.step.prev_action[first].any()
+    assert timesteps.step.prev_action[~first].all()
 
 
 def test_memory_counts_unbroken_through_every_episode():
-    moments, _, _ = advanced(Counting(ends=5), 23)
-    np.testing.assert_array_equal(moments.note[0], moments.step.obs[:, 0])
+    timesteps, _, _ = advanced(Counting(ends=5), 23)
+    np.testing.assert_array_equal(timesteps.note[0], timesteps.step.obs[:, 0])
 
 
 def test_success_is_reported_where_the_episode_ends():
@@ -78,17 +78,17 @@ def test_success_is_reported_where_the_episode_ends():
 
 @pytest.mark.parametrize("steps", [10, 14])
 def test_reliving_restores_notes_and_memory(steps):
-    moments, _, actor = advanced(Counting(), steps)
+    timesteps, _, actor = advanced(Counting(), steps)
     replay = ring.init(rollout.stored(AGENT, actor), 64)
-    blank = jax.tree.map(lambda ring, new: ring.at[: new.shape[0]].set(new), replay.moments, moments)
+    blank = jax.tree.map(lambda ring, new: ring.at[: new.shape[0]].set(new), replay.timesteps, timesteps)
     blank = blank._replace(note=jax.tree.map(lambda note: note * 0 - 9, blank.note))
-    replay = ring.Replay(blank, jnp.array(moments.step.reward.shape[0]))
+    replay = ring.Replay(blank, jnp.array(timesteps.step.reward.shape[0]))
     spec = Counting().spec
     state = STATE
     again, replay = jax.jit(lambda a, r: rollout.refresh(AGENT, spec, state, a, r, jax.random.key(1), 20))(
         actor, replay
     )
-    np.testing.assert_array_equal(replay.moments.note[0][: len(moments.note[0])], moments.note[0])
+    np.testing.assert_array_equal(replay.timesteps.note[0][: len(timesteps.note[0])], timesteps.note[0])
     assert float(again.memory) == float(actor.memory)
 
 

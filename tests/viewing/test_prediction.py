@@ -56,9 +56,9 @@ def predicted_by_hand(model, seen):
     state, rows = jax.tree.map(lambda leaf: leaf[START - 1], inferred.state), []
     for t in range(START, TIME):
         if model.deterministic:  # z does not depend on x
-            moment = jnp.zeros(X), prev_action[t], jnp.array(False), jnp.zeros(Z)
+            timestep = jnp.zeros(X), prev_action[t], jnp.array(False), jnp.zeros(Z)
             start = jax.tree.map(lambda leaf: leaf[None], state)
-            z = model.infer(start, *(leaf[None, None] for leaf in moment)).z[0, 0]
+            z = model.infer(start, *(leaf[None, None] for leaf in timestep)).z[0, 0]
         else:
             prior = model.prior(state.d, prev_action[t])
             z = prior.mean + prior.sigma * NOISE[0][t]

@@ -82,7 +82,7 @@ class Agent(Protocol):
         ...
 
     def note(self, memory: Any) -> Any:
-        """What the replay shall keep of a memory beside the moment that it has just perceived."""
+        """What the replay shall keep of a memory beside the timestep that it has just perceived."""
         ...
 
     def pretrain(self, state: Any, windows: Window, key: Key[Array, ""]) -> tuple[Any, Metrics]:

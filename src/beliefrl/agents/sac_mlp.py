@@ -43,7 +43,7 @@ class SACMLPAgent(SACAgent):
 
     @property
     def window(self) -> WindowShape:
-        """One transition and what follows it; it is masked where an episode ends between its two moments."""
+        """One transition and what follows it; it is masked where an episode ends between its two timesteps."""
         return WindowShape(burn_in=0, length=self.n_step)
 
     @property

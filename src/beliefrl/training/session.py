@@ -86,8 +86,8 @@ class Session:
     def restore(self, shapes: SeedState) -> Snapshot:
         """Restore the last undamaged checkpoint, and truncate the log to its length at that time."""
         ring = shapes.replay
-        like = shapes._replace(replay=ring._replace(moments=()))
-        found = self.checkpoints.restore(like, ring.moments, RENAMED)
+        like = shapes._replace(replay=ring._replace(timesteps=()))
+        found = self.checkpoints.restore(like, ring.timesteps, RENAMED)
         for why in found.passed_over:
             self.report(Event(Phase.RESUMING, found.step, note=f"{why} The checkpoint before it is used."))
         self.recorder.rewind({int(seed): length for seed, length in found.progress["metrics"].items()})
@@ -95,7 +95,7 @@ class Session:
         self.report(Event(Phase.RESUMING, found.step, note=f"goes on from the checkpoint of step {found.step:,}"))
         if isinstance(self.task, GymnasiumTask):
             self.report(Event(Phase.RESUMING, found.step, note="a new episode begins: an environment cannot be saved"))
-        seeds = found.tree._replace(replay=found.tree.replay._replace(moments=found.timesteps))
+        seeds = found.tree._replace(replay=found.tree.replay._replace(timesteps=found.timesteps))
         return Snapshot(self.last, jax.tree.map(jnp.asarray, seeds))
 
     def _listen(self, event: Event) -> None:
@@ -168,8 +168,8 @@ class Session:
 
     def _save(self, snapshot: Snapshot) -> None:
         replay = snapshot.seeds.replay
-        rest = snapshot.seeds._replace(replay=replay._replace(moments=()))
+        rest = snapshot.seeds._replace(replay=replay._replace(timesteps=()))
         lost = sorted(self.lost)
         progress = {"progress": list(snapshot.progress), "metrics": self.recorder.lengths(), "lost": lost}
-        self.checkpoints.save(snapshot.progress.step, progress, rest, replay.moments, np.asarray(replay.added))
+        self.checkpoints.save(snapshot.progress.step, progress, rest, replay.timesteps, np.asarray(replay.added))
         self.last, self.saved_at = snapshot.progress, time.monotonic()

@@ -23,7 +23,7 @@ SMALL = {  # VRM
 
 @partial(jax.jit, static_argnums=(1, 2))
 def windows(key, batch, time, is_first=None, exists=None):
-    """Random windows of `time` moments that begin at an episode's first, where nothing else is said.
+    """Random windows of `time` timesteps that begin at an episode's first, where nothing else is said.
 
     `is_first` and `exists` are (batch, time), what is returned (time, batch, ...).
     """
@@ -53,7 +53,7 @@ def differ(a, b):
 
 
 def changed_where_missing(agent, state, window, exists):
-    """What a cycle and its updates make of windows, and of the same with other moments where none exist."""
+    """What a cycle and its updates make of windows, and of the same with other timesteps where none exist."""
     other = windows(jax.random.key(9), *exists.shape)
     exists = exists.T
     changed = jax.tree.map(
