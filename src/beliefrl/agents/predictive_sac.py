@@ -86,7 +86,7 @@ class PredictiveSACAgent:
     """Adam's learning rate for both Q."""
     lr_alpha: float = 1e-3
     """Adam's learning rate for log α, the temperature."""
-    alpha_start: float = 0.01
+    alpha_start: float = 0.1
     """α before training, in units of the returns."""
     target_entropy: float | None = None
     """Entropy that α aims at; None is minus the number of actions."""
