@@ -63,7 +63,7 @@ def test_what_was_saved_or_is_the_users_stays(tmp_path, name):
 
 def test_the_config_of_another_program_stays(tmp_path):
     (tmp_path / "config.json").write_text('{"editor": "vi"}')
-    with pytest.raises(UserError, match=r"exists already: choose another --out\.$"):
+    with pytest.raises(UserError, match=r"exists already: choose another --out; in Python out=\.$"):
         make(tmp_path, CONFIG)
     assert (tmp_path / "config.json").read_text() == '{"editor": "vi"}'
 
