@@ -11,7 +11,7 @@ So every step of the loop is one step of the environment, and the current timest
 All functions are for one seed; `phases` maps them over seeds.
 """
 
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,8 +22,6 @@ from beliefrl.tasks import Task
 from beliefrl.training import replay as ring
 from beliefrl.training.replay import Replay
 from beliefrl.types import Spec, StoredTimestep, Timestep
-
-Tree = TypeVar("Tree")
 
 
 class ActorState(NamedTuple):
@@ -45,7 +43,7 @@ class Episode(NamedTuple):
     success: Bool[Array, "*batch"]
 
 
-def strong(tree: Tree) -> Tree:
+def strong(tree: Any) -> Any:
     """The same without weak types, which Python's numbers in a task or agent leave: XLA would compile twice."""
 
     def cast(leaf: Any) -> Array:
