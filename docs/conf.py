@@ -32,7 +32,7 @@ release = version = beliefrl.__version__
 html_show_copyright = False
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.viewcode", "sphinx_copybutton"]
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "jupyter_execute"]  # what a build writes
 nb_execution_mode = "off"  # the notebook is shown with the outputs that it has
 myst_heading_anchors = 3
 nitpicky = True
