@@ -1,6 +1,7 @@
 """Sweeps on a real Ray cluster of two nodes on this machine, as a user starts them. Needs the extra `sweep`."""
 
 import contextlib
+import json
 import os
 import pathlib
 import signal
@@ -68,8 +69,9 @@ def rows(folder):
     return {path.parts[-3]: path.read_text() for path in folder.glob("*/metrics/seed-*.jsonl")}
 
 
-def wait_until_it_learns(folder, process):
-    while not any('"update"' in text for text in rows(folder).values()):
+def wait_until_it_learns(folder, process, begun=0):
+    """Wait for an update after step `begun`."""
+    while not any('"update"' in text for text in rows(folder).values()) or last_step(folder) <= begun:
         assert process.poll() is None, process.stdout.read()
         time.sleep(0.1)
 
@@ -92,20 +94,26 @@ def test_a_cluster_trains_what_this_machine_would(tmp_path, head):
     assert sorted(there.values()) == sorted(here.values())
 
 
+def last_step(folder):
+    """The newest step in the log of the only training."""
+    (text,) = rows(folder).values()
+    return json.loads(text.rpartition("\n")[0].splitlines()[-1])["step"]  # the last line may be half written
+
+
 def test_a_sweep_on_a_cluster_can_be_stopped_and_goes_on(tmp_path, head):
-    process = begin(tmp_path, head, LONG.replace("12000", "40000"))  # Ray takes seconds to stop it
-    wait_until_it_learns(tmp_path, process)
-    process.send_signal(signal.SIGINT)
-    output, _ = process.communicate(timeout=300)
-    assert process.returncode == 130, output
-    assert "stopped with 0 of 1 trainings finished" in output
-    (folder,) = (path.parent for path in tmp_path.glob("*/config.json"))
-    assert not (folder / "results.json").exists()
-    assert list((folder / "checkpoints").iterdir())
-    again = begin(tmp_path, head, "")
-    output, _ = again.communicate(timeout=300)
-    assert again.returncode == 0, output
-    assert "1 of 1 trainings finished" in output
+    begun = 0
+    for line in (LONG.replace("12000", "1000000"), ""):  # far more steps than are made before it stops
+        process = begin(tmp_path, head, line)
+        wait_until_it_learns(tmp_path, process, begun)
+        process.send_signal(signal.SIGINT)
+        output, _ = process.communicate(timeout=300)
+        assert process.returncode == 130, output
+        assert "stopped with 0 of 1 trainings finished" in output
+        (folder,) = (path.parent for path in tmp_path.glob("*/config.json"))
+        assert not (folder / "results.json").exists()
+        assert list((folder / "checkpoints").iterdir())
+        assert last_step(tmp_path) > begun
+        begun = last_step(tmp_path)
 
 
 def test_a_training_whose_worker_dies_goes_on_by_itself(tmp_path, head):
