@@ -45,7 +45,8 @@ def test_an_example_says_what_quick_does(name):
 def test_an_example_runs_and_can_be_started_again(tmp_path, name):
     if name.startswith("05"):
         pytest.importorskip("sb3_contrib")
-    for _ in range(2):
+    again = name[:2] in ("00", "03")  # one makes a new folder, one resumes
+    for _ in range(1 + again):
         assert PHRASES[name] in output(tmp_path, EXAMPLES / name, "--quick")
 
 
