@@ -1,32 +1,22 @@
 """Learning curves of a run whose files are written by hand."""
 
-import json
-
 import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 from beliefrl.analysis.curves import draw_curve, evaluations, standard_error
-from beliefrl.runs.run import Run
+from beliefrl.analysis.final import rows, write_final
+from beliefrl.analysis.groups import groups
+from beliefrl.analysis.scalability import COLUMNS, STEPS, cells, costs, wall_clock, write_costs
+from beliefrl.analysis.tables import Column, latex, markdown
+from beliefrl.cli import main
 from beliefrl.types import UserError
+from written import HOUR, TWO_SEEDS, a_run, flat
 
 
-def a_run(folder, seeds, success=False):
-    """A run's folder with these evaluations of each seed: (step, returns with sampled actions)."""
-    (folder / "metrics").mkdir()
-    options = {"seed": 0, "seeds": len(seeds)}
-    config = {"agent": "vrm", "hyperparameters": {}, "task": "pendulum-v", "constants": {}, "options": options}
-    (folder / "config.json").write_text(json.dumps(config))
-    for seed, rows in enumerate(seeds):
-        lines = [{"step": 1, "kind": "update", "loss": 0.0}]
-        for step, returns in rows:
-            successes = {"sampled_success": [True, False], "mode_success": [True, True]} if success else {}
-            lines.append({"step": step, "kind": "evaluation", "sampled": returns, "mode": [0.0], **successes})
-        text = "".join(json.dumps(line) + "\n" for line in lines)
-        (folder / "metrics" / f"seed-{seed}.jsonl").write_text(text)
-    return Run(folder)
-
-
-TWO_SEEDS = [[(10, [1.0, 2.0]), (20, [3.0, 5.0])], [(10, [-1.0, 4.0]), (20, [7.0, 7.0])]]
+def with_success(seeds):
+    """The same evaluations, with success in the first of two episodes."""
+    return [[(step, returns, [True, False]) for step, returns in rows] for rows in seeds]
 
 
 def test_evaluations_are_every_seeds_means(tmp_path):
@@ -42,7 +32,7 @@ def test_evaluations_go_as_far_as_all_seeds_have_come(tmp_path):
 
 
 def test_success_is_read_as_a_rate(tmp_path):
-    _, seeds = evaluations(a_run(tmp_path, TWO_SEEDS, success=True), "sampled_success")
+    _, seeds = evaluations(a_run(tmp_path, with_success(TWO_SEEDS)), "sampled_success")
     np.testing.assert_array_equal(seeds, np.full((2, 2), 0.5))
 
 
@@ -73,7 +63,7 @@ def test_success_has_a_panel_of_its_own(tmp_path):
     (tmp_path / "with").mkdir()
     (tmp_path / "without").mkdir()
     width, height = size(draw_curve(a_run(tmp_path / "without", TWO_SEEDS)))
-    assert size(draw_curve(a_run(tmp_path / "with", TWO_SEEDS, success=True))) == (2 * width, height)
+    assert size(draw_curve(a_run(tmp_path / "with", with_success(TWO_SEEDS)))) == (2 * width, height)
 
 
 @pytest.mark.parametrize("seeds", [[[]], [TWO_SEEDS[0], []]], ids=["no seed", "one of two seeds"])
@@ -81,3 +71,110 @@ def test_there_is_no_curve_without_evaluations(tmp_path, seeds):
     with pytest.raises(UserError, match="no evaluation"):
         draw_curve(a_run(tmp_path, seeds))
     assert not (tmp_path / "curve.png").exists()
+
+
+# The table of final results, for runs with known returns and times.
+
+
+def test_a_row_tells_returns_with_their_spread_and_when_the_task_was_solved(tmp_path):
+    made = [a_run(tmp_path / "a", [flat(100, 960, 500), flat(100, 980, 700)], task="cartpole", **HOUR)]
+    ((task, agent, seeds, steps, sampled, mode, solved, time),) = rows(groups(made))
+    assert (task, agent, seeds, steps) == ("`cartpole`", "`vrm`", "0 to 1", "30")
+    assert sampled == "600.0 ± 100.0"
+    assert mode == "7.0 ± 0.0"
+    assert solved == "20"  # the mean over seeds is 970 there
+    assert time == "0.50 h"
+
+
+@pytest.mark.parametrize(("task", "enough"), [("cartpole-p", 955.0), ("target-reaching", 134.0)])
+def test_a_task_is_solved_by_the_mean_over_seeds(tmp_path, task, enough):
+    (row,) = rows(groups([a_run(tmp_path / "a", [flat(-1500, enough)], task=task)]))
+    assert row[6] == "20"
+    (row,) = rows(groups([a_run(tmp_path / "b", [flat(-1500, enough), flat(-1500, enough - 50)], task=task)]))
+    assert row[6] == "no"
+
+
+def test_of_a_task_without_a_known_good_return_nobody_says_that_it_is_solved(tmp_path):
+    (row,) = rows(groups([a_run(tmp_path / "a", [flat(10, 2000)], task="hopper-v")]))
+    assert row[6] == "-"
+
+
+def test_success_is_told_where_a_task_has_it_and_an_unknown_time_is_unknown(tmp_path):
+    seed = [(10, [1.0, 3.0], [True, False])]
+    (row,) = rows(groups([a_run(tmp_path / "a", [seed], task="target-reaching")]))
+    assert row[4] == "2.0; success 50%"
+    assert row[5] == "7.0; success 100%"
+    assert row[7] == "unknown"
+
+
+def test_runs_without_an_evaluation_are_not_in_it(tmp_path):
+    assert rows(groups([a_run(tmp_path / "a", [[]])])) == []
+
+
+def test_the_command_writes_markdown_and_latex(tmp_path, capsys):
+    run = a_run(tmp_path / "a", [flat(-150.0)])
+    main(["figure", "table", str(run.folder), "-o", str(tmp_path / "table.md")])
+    text = (tmp_path / "table.md").read_text()
+    assert text in capsys.readouterr().out
+    assert text == write_final(groups([run]), tmp_path / "other").read_text()
+    assert r"-150.0 &" in (tmp_path / "table.tex").read_text()
+
+
+def test_what_would_break_a_table_is_escaped():
+    columns = [Column("a"), Column("b", is_number=True)]
+    assert markdown(columns, [("x|y", "1")]) == "| a | b |\n| --- | ---: |\n| x\\|y | 1 |\n"
+    assert r"a\_b & 5\% $\pm$ 1 \\" in latex(columns, [("a_b", "5% ± 1")])
+
+
+# The table of the cost of training, for runs with known times and sizes.
+
+SESSIONS = {
+    "started": "2026-01-01T10:00:00+00:00",
+    "ended": "2026-01-01T10:01:00+00:00",
+    "resumed": [{"started": "2026-01-02T00:00:00+00:00", "ended": "2026-01-02T00:00:40+00:00"}],
+}
+
+
+@pytest.fixture
+def run(tmp_path):
+    """Two seeds, 20 steps each, 100 seconds."""
+    made = a_run(tmp_path / "a", [flat(1.0, 2.0), flat(1.0, 2.0)], agent="sac_mlp", **SESSIONS)
+    arrays = {
+        ".actor.weight": np.zeros((2, 3, 4)),
+        ".actor.bias": np.zeros((2, 3)),
+        ".learned_optimiser": np.zeros((2, 5)),
+    }
+    save_file(arrays, made.folder / "agent.safetensors")
+    return made
+
+
+def test_wall_clock_is_the_sum_of_the_sessions(run, tmp_path):
+    assert wall_clock(run) == 100
+    killed = {**SESSIONS, "resumed": [{"started": "2026-01-02T00:00:00+00:00"}]}
+    assert wall_clock(a_run(tmp_path / "b", [flat(1.0)], **killed)) is None
+
+
+def test_costs_are_of_one_seed(run):
+    (cost,) = costs(groups([run]))
+    assert cost.seconds == pytest.approx(100 / 20 / 2 * STEPS)
+    assert cost.parameters == 20  # every array that is saved, whatever its name
+    assert cost.steps == 20
+
+
+def test_the_table_is_markdown_and_latex(run, tmp_path):
+    table = COLUMNS, [cells(cost) for cost in costs(groups([run]))]
+    assert markdown(*table).splitlines()[-1] == "| sac_mlp | pendulum-v | 69.44 h | 0.00 M | 20 |"
+    assert r"sac\_mlp & pendulum-v & 69.44 h & 0.00 M & 20 \\" in latex(*table)
+    assert write_costs(groups([run]), tmp_path / "table").read_text() == markdown(*table)
+    assert (tmp_path / "table.tex").read_text() == latex(*table)
+
+
+def test_what_is_not_known_is_said_to_be_unknown(tmp_path):
+    (cost,) = costs(groups([a_run(tmp_path / "a", [flat(1.0)])]))
+    assert (cost.seconds, cost.parameters) == (None, None)
+    assert "| unknown | unknown |" in markdown(COLUMNS, [cells(cost)])
+
+
+def test_sessions_that_are_no_sessions_have_no_time(tmp_path):
+    for index, session in enumerate(({}, {"started": 5, "ended": 6}, {"started": "today", "ended": "later"})):
+        assert wall_clock(a_run(tmp_path / f"{index}", [flat(1.0)], **{**SESSIONS, "resumed": [session]})) is None

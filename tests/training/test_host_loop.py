@@ -18,8 +18,7 @@ from beliefrl.tasks.pendulum import Pendulum, PendulumState
 from beliefrl.training import host_loop, lockstep, phases, session
 from beliefrl.training.lockstep import Lockstep
 from beliefrl.types import UserError
-from small import MODELS, SEQUENCES, SHARED, leaves, trained
-from worlds import Counting, CountingAgent
+from worlds import MODELS, SEQUENCES, SHARED, Counting, CountingAgent, leaves, trained
 from wrong import Fine, Killed, Raising
 
 SMALL = {"vrm": MODELS | SEQUENCES, "sac-mlp": {"batch_size": 8, "pretrain_updates": 10, "standardise": True}}

@@ -11,7 +11,7 @@ from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import lockstep
 from beliefrl.training.lockstep import Lockstep
 from beliefrl.training.schedule import Options, stages
-from small import SHARED
+from worlds import SHARED
 from wrong import Fine, raising
 
 

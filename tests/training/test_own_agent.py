@@ -3,17 +3,22 @@
 import dataclasses
 import json
 import sys
+from typing import Any, ClassVar, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import beliefrl
 from beliefrl.agents.vrm import VRMAgent
+from beliefrl.analysis.scalability import parameters
 from beliefrl.models.nets import Gaussian
+from beliefrl.runs import arrays
+from beliefrl.training import phases
 from beliefrl.training.evaluation import agent_of
 from beliefrl.types import UserError, perception
-from worlds import CountingAgent
+from worlds import Counting, CountingAgent
 
 OPTIONS = {"steps": 20, "eval_every": 20, "eval_episodes": 1, "checkpoint_steps": 10}
 
@@ -135,3 +140,65 @@ def test_a_name_with_control_characters_is_told_without_them(altered):
     with pytest.raises(UserError) as raised:
         agent_of(altered(agent="trap\x1b[31m:Agent"))
     assert str(raised.value).isprintable()
+
+
+# What of an agent's state is saved and counted: its networks, whatever its fields are called.
+
+
+class OwnState(NamedTuple):
+    optimiser_network: Any  # a network, although its name says otherwise
+    opt_state: Any
+
+
+class OwnAgent(CountingAgent):
+    def init(self, key, spec):
+        return OwnState(jnp.ones(7), jnp.ones(1000))
+
+    def networks(self, state):
+        return state._replace(opt_state=())
+
+
+def test_only_the_networks_of_an_agent_are_saved_and_counted(tmp_path):
+    options = {"steps": 4, "seeds": 2, "eval_every": 4, "eval_episodes": 1}
+    run = beliefrl.train(OwnAgent(), Counting(), tmp_path / "run", **options)
+    assert set(arrays.load(run.folder / "agent.safetensors")) == {".optimiser_network"}
+    assert parameters(run) == 7
+
+
+# Which metrics end a seed, and that no two share a name.
+
+
+class Undefined(CountingAgent):
+    """Returns a metric that is NaN."""
+
+    def update(self, state, batch, key):
+        return state, {"ratio": jnp.array(jnp.nan), "count": jnp.ones(())}
+
+
+class Diverging(Undefined):
+    losses: ClassVar = ("ratio",)
+
+
+SHORT = {"steps": 14, "seeds": 1, "eval_every": 14, "eval_episodes": 1}
+
+
+def test_a_metric_that_is_no_loss_may_be_undefined_and_a_loss_may_not(tmp_path):
+    run = beliefrl.train(Undefined(), Counting(), tmp_path / "undefined", **SHORT)
+    (row,) = run.rows(0, "update")
+    assert row["count"] == 1
+    assert "ratio" not in row
+    with pytest.raises(UserError, match=r"All seeds have diverged; .*ratio is not finite"):
+        beliefrl.train(Diverging(), Counting(), tmp_path / "diverging", **SHORT)
+
+
+class Twice(CountingAgent):
+    def begin_cycle(self, state, windows, key):
+        state, batches, _ = super().begin_cycle(state, windows, key)
+        return state, batches, {"valid": jnp.zeros(())}
+
+
+def test_two_metrics_of_one_name_are_refused():
+    agent = Twice()
+    seed = phases.begin(agent, Counting(), 100, jax.random.key(0))
+    with pytest.raises(UserError, match="both return a metric 'valid'"):
+        jax.eval_shape(lambda seed: phases.learn_cycle(agent, seed, jnp.array(10)), seed)

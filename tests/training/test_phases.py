@@ -8,8 +8,7 @@ import pytest
 from beliefrl import agents, tasks
 from beliefrl.runs.options import Options
 from beliefrl.training import phases, schedule
-from small import MODELS, SEQUENCES, SHARED, leaves, trained
-from worlds import Counting, CountingAgent
+from worlds import MODELS, SEQUENCES, SHARED, Counting, CountingAgent, leaves, trained
 
 SMALL = {
     "vrm": MODELS | SEQUENCES | {"standardise": True},
