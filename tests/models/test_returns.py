@@ -41,8 +41,8 @@ timesteps = st.sampled_from([3, 10]).flatmap(
 
 @settings(deadline=None, max_examples=40)
 @given(timesteps, st.sampled_from([1, 2, 3, 5, 20]))
-def test_returns_are_those_of_walking_along_the_episode(given_moments, n):
-    rewards, firsts, ends = given_moments
+def test_returns_are_those_of_walking_along_the_episode(window, n):
+    rewards, firsts, ends = window
     terminated = [end and i + 1 < len(firsts) and firsts[i + 1] for i, end in enumerate(ends)]
     step = step_of(rewards, firsts, terminated)
     valid = ~step.is_first[1:]
@@ -55,15 +55,25 @@ def test_returns_are_those_of_walking_along_the_episode(given_moments, n):
         np.testing.assert_allclose(returns.discount[first, 0], discount, rtol=1e-6)
 
 
-def test_a_truncated_episode_bootstraps_from_its_last_timestep_and_a_terminated_one_does_not():
+@pytest.mark.parametrize(
+    ("n", "reward", "after"),
+    [
+        (1, [1, 1, 1, 1], [10, 20, 40, 50]),
+        (2, [1 + GAMMA, 1, 1 + GAMMA, 1], [20, 20, 50, 50]),
+        (4, [1 + GAMMA, 1, 1 + GAMMA, 1], [20, 20, 50, 50]),
+    ],
+)
+def test_a_truncated_episode_bootstraps_from_its_last_timestep_and_a_terminated_one_does_not(n, reward, after):
     firsts = [True, False, False, True, False, False]
     step = step_of([0, 1, 1, 0, 1, 1], firsts, [False, False, False, False, False, True])
-    beliefs = 10 * step.obs
-    batch = jax.jit(transition_batch, static_argnums=(4, 5))(step, ~step.is_first[1:], beliefs, beliefs, 4, GAMMA)
-    batch = jax.tree.map(np.asarray, batch)
-    np.testing.assert_array_equal(batch.next_belief[:, 0, 0][batch.valid[:, 0]], [20, 20, 50, 50])
-    np.testing.assert_array_equal(batch.terminated[:, 0][batch.valid[:, 0]], [False, False, True, True])
-    np.testing.assert_allclose(batch.reward[:, 0][batch.valid[:, 0]], [1 + GAMMA, 1, 1 + GAMMA, 1])
+    valid = ~step.is_first[1:, 0]
+    batch = jax.jit(transition_batch, static_argnums=(4, 5))(step, valid[:, None], step.obs, 10 * step.obs, n, GAMMA)
+    batch = jax.tree.map(lambda leaf: np.asarray(leaf)[valid, 0], batch)
+    np.testing.assert_array_equal(batch.belief[:, 0], [0, 1, 3, 4])
+    np.testing.assert_array_equal(batch.action[:, 0], [1, 2, 4, 5])
+    np.testing.assert_array_equal(batch.next_belief[:, 0], after)
+    np.testing.assert_array_equal(batch.terminated, [False, False, n > 1, True])
+    np.testing.assert_allclose(batch.reward, reward)
 
 
 @pytest.mark.parametrize(
