@@ -41,8 +41,8 @@ timesteps = st.sampled_from([3, 10]).flatmap(
 
 @settings(deadline=None, max_examples=40)
 @given(timesteps, st.sampled_from([1, 2, 3, 5, 20]))
-def test_returns_are_those_of_walking_along_the_episode(given_moments, n):
-    rewards, firsts, ends = given_moments
+def test_returns_are_those_of_walking_along_the_episode(given_timesteps, n):
+    rewards, firsts, ends = given_timesteps
     terminated = [end and i + 1 < len(firsts) and firsts[i + 1] for i, end in enumerate(ends)]
     step = step_of(rewards, firsts, terminated)
     valid = ~step.is_first[1:]
