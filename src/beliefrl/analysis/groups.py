@@ -131,12 +131,8 @@ def groups(runs: Sequence[Run], defaults: Mapping[str, Row] | None = None) -> li
         same_agent = [settings[other.folder] for other in runs if other.config["agent"] == run.config["agent"]]
         same_task = [other.config["constants"] for other in runs if task_of(other) == task_of(run)]
         task = " ".join([task_of(run), *_differences(run.config["constants"], same_task)])
-        label = " ".join(
-            [
-                run.config["agent"],
-                *_differences(results.changed(settings[run.folder], usual[run.config["agent"]]), same_agent),
-            ]
-        )
+        own = results.changed(settings[run.folder], usual[run.config["agent"]])
+        label = " ".join([run.config["agent"], *_differences(own, same_agent)])
         of = seeds.setdefault((task, label), {})
         for seed in run.seeds:
             if seed not in of or _precedence(run, seed) > _precedence(of[seed], seed):
