@@ -31,13 +31,14 @@ def ours() -> float:
     agent = agents.make("vrm")
     program = phases.compile_program(agent, Noise(OBS, ACTIONS), capacity=EPISODES * LENGTH, episodes=1)
     seeds, stretch = program.begin(jax.random.split(jax.random.key(0), 1)), phases.stretch_length(agent)
-    for step in range(0, EPISODES * LENGTH, stretch):
+    explored = EPISODES * LENGTH
+    for step in range(0, explored, stretch):
         seeds, _ = program.explore(seeds, step, stretch)
-    seeds, _ = program.learn(seeds, step, 1)
+    seeds, _ = program.learn(seeds, explored, 1)
     jax.block_until_ready(seeds)
     began = time.perf_counter()
     for _ in range(0, OURS, stretch):
-        seeds, _ = program.learn(seeds, step, stretch // agent.cycle)
+        seeds, _ = program.learn(seeds, explored, stretch // agent.cycle)
     jax.block_until_ready(seeds)
     return 1e3 * (time.perf_counter() - began) / OURS
 
