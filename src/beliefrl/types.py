@@ -1,7 +1,7 @@
 """The types that the whole library shares: a timestep, a window of timesteps, a task's sizes, a user's mistake.
 
 Axis names in shapes, everywhere: `seed` (one training each), `batch` (windows), `time` (timesteps of a window),
-`obs`, `action`, `belief` (what the controller reads), `d` (recurrent state), `z` (latent variable), `x` (perception).
+`obs`, `action`, `belief` (input of the controller), `d` (recurrent state), `z` (latent variable), `x` (perception).
 """
 
 import dataclasses

@@ -153,7 +153,7 @@ def settings(config: dict[str, Any]) -> list[str] | None:
 
 
 def _session(session: dict[str, Any]) -> dict[str, str]:
-    """When, where and how a session of a training ran, as text."""
+    """Time, device, commit, command and versions of a session of a training, as text."""
     return {
         "started": str(session.get("started", "?")),
         "ended": str(session.get("ended", "?")),
