@@ -1,4 +1,4 @@
-"""A training step of VRM raced against the authors' PyTorch code: milliseconds of both, in turn, on this machine.
+"""Compare the time of a training step of VRM with that of the authors' PyTorch code, in turn, on this machine.
 
 Both run the paper's settings at the sizes of velocities-only Hopper (6 observations, 3 actions) on noise: each step
 acts once, updates the controller once and, every fifth step, the keep-learning model. The authors draw these updates
@@ -21,7 +21,7 @@ ROUNDS, OURS, THEIRS = 5, 300, 50  # steps timed in each round
 
 
 def ours() -> float:
-    """Milliseconds a step of beliefrl's vrm."""
+    """Milliseconds per step of beliefrl's vrm."""
     import jax
 
     from beliefrl import agents
@@ -30,20 +30,21 @@ def ours() -> float:
 
     agent = agents.make("vrm")
     program = phases.compile_program(agent, Noise(OBS, ACTIONS), capacity=EPISODES * LENGTH, episodes=1)
-    seeds, step, stretch = program.begin(jax.random.split(jax.random.key(0), 1)), 0, phases.stretch_length(agent)
-    for step in range(0, EPISODES * LENGTH, stretch):
+    seeds, stretch = program.begin(jax.random.split(jax.random.key(0), 1)), phases.stretch_length(agent)
+    explored = EPISODES * LENGTH
+    for step in range(0, explored, stretch):
         seeds, _ = program.explore(seeds, step, stretch)
-    seeds, _ = program.learn(seeds, step, 1)
+    seeds, _ = program.learn(seeds, explored, 1)
     jax.block_until_ready(seeds)
     began = time.perf_counter()
     for _ in range(0, OURS, stretch):
-        seeds, _ = program.learn(seeds, step, stretch // agent.cycle)
+        seeds, _ = program.learn(seeds, explored, stretch // agent.cycle)
     jax.block_until_ready(seeds)
     return 1e3 * (time.perf_counter() - began) / OURS
 
 
 def theirs(checkout: str) -> float:
-    """Milliseconds a step of the authors' code."""
+    """Milliseconds per step of the authors' code."""
     sys.path.insert(0, checkout)
     import numpy as np
     from vrdm import VRDM, VRM
@@ -78,7 +79,7 @@ def theirs(checkout: str) -> float:
 
 
 def main(checkout: str, python: str) -> None:
-    """Race `ROUNDS` times in turn, each in a process of its own, and print medians."""
+    """Time both `ROUNDS` times in turn, each in a process of its own; print medians and the median ratio."""
     times = {"ours": [], "theirs": []}
     for number in range(ROUNDS):
         for who, command in (("ours", [sys.executable]), ("theirs", [python])):

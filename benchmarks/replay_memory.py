@@ -1,4 +1,4 @@
-"""The memory of the replay for a training of a million steps, as a ratio to the data that it stores.
+"""The memory of a replay of a million timesteps, divided by that of the data in it, with episodes of 1,000 steps.
 
 python benchmarks/replay_memory.py
 """
@@ -9,7 +9,7 @@ from beliefrl import Options, make_agent
 from beliefrl.training import phases, schedule
 from beliefrl.training.bench import Noise
 
-STEPS, EPISODE = 800_000, 1000  # with 1.25 timesteps a step the ring is as large as it gets by default
+STEPS, EPISODE = 800_000, 1000  # with room for 1.25 timesteps a step, this is the largest replay by default
 
 
 def main() -> None:

@@ -1,6 +1,6 @@
-"""Train on your own environment, which has Gymnasium's interface: here a cart that must drive to a mark and stop there.
+"""Train on your own environment with Gymnasium's interface: here a cart that must drive to a mark and stop there.
 
-    pip install beliefrl
+    pip install -c constraints.txt -e .                    # in a clone of the repository
     python examples/01_your_own_environment.py             # 6,000 steps: about six minutes on two cores
     python examples/01_your_own_environment.py --quick     # 600 steps, to see it run: 23 s of CPU time
 
@@ -9,10 +9,10 @@ A registered environment needs no Python code. Here `my_robots` is a module that
     beliefrl train vrm gym:my_robots:Cart-v0 --observe 0 --seeds 2
     beliefrl train vrm gym:MountainCarContinuous-v0 --observe 0 --constants max_episode_steps=500
 
-A second start goes on with the run in runs/cart: it repeats nothing that is done.
+A second start continues the run in runs/cart. If that run is finished, it is not trained again.
 
-The environment receives actions in the range of its own Box. The agent sees only the entries `--observe` of the
-observation (in Python: `indices`). Here it does not see the cart's speed, and must infer it from past positions.
+The environment receives actions in the range of its own Box. The agent observes only the entries that `--observe`
+selects (in Python: `indices`). Here it does not observe the cart's speed, and must infer it from past positions.
 """
 
 import gymnasium

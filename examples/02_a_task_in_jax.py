@@ -1,12 +1,12 @@
-"""A task in pure JAX. It is compiled together with the agent, so that many seeds train in one program.
+"""A task in pure JAX. It is compiled together with the agent, so many seeds are trained in one program.
 
-    pip install beliefrl
+    pip install -c constraints.txt -e .             # in a clone of the repository
     python examples/02_a_task_in_jax.py             # 6,000 steps
     python examples/02_a_task_in_jax.py --quick     # 1,000 steps, enough to see the difference: 42 s of CPU time
 
 The first observation of an episode shows whether a lamp is on the left or on the right. After some steps in the dark,
-the agent must point to it. Without memory the best return is 0, with memory it is 1. The agents are small ones: an LSTM
-of 32 numbers is enough to remember a side. Each start makes new folders.
+the agent must point to it. Without memory the best return is 0, with memory it is 1. The agents are small: an LSTM with
+a state of size 32 is enough to remember a side. Each start makes new folders.
 """
 
 import dataclasses

@@ -1,7 +1,7 @@
 """A new agent: soft actor-critic on the last few observations, which determine a hidden velocity.
 
-    pip install beliefrl
-    python examples/03_a_new_agent.py             # 6,000 steps on the pendulum without its speed: a few minutes
+    pip install -c constraints.txt -e .           # in a clone of the repository
+    python examples/03_a_new_agent.py             # 6,000 steps on the pendulum with hidden velocity: a few minutes
     python examples/03_a_new_agent.py --quick     # 600 steps, to see it run: 43 s of CPU time
 
 After 6,000 steps two seeds have returns of -750 and -495. A random policy gets about -1200. A second start continues
@@ -9,7 +9,7 @@ the run in runs/stack.
 
 An agent is a frozen dataclass of hyperparameters whose methods are pure functions, for one seed and one actor. The
 training loop maps them over seeds and environments. `SACAgent` has the hyperparameters of Table 1 of the paper, and the
-controller. An agent adds its memory in acting, the windows that it learns from, and how beliefs are formed from both.
+controller. An agent adds its memory for acting, the windows that it learns from, and how it forms beliefs.
 """
 
 import dataclasses

@@ -1,10 +1,11 @@
-"""Train another library's agent on a BeliefRL task: RecurrentPPO of sb3-contrib, on the pendulum with only its speed.
+"""Train another library's agent on a BeliefRL task: RecurrentPPO of sb3-contrib on `pendulum-v`.
 
-    pip install beliefrl sb3-contrib
+    pip install -e . sb3-contrib                      # in a clone of the repository
     python examples/05_train_elsewhere.py             # 500,000 steps
     python examples/05_train_elsewhere.py --quick     # 2,048 steps, to see it run
 
-The return of an episode is about -1200 for a random policy, and -150 if the pendulum is swung up and held.
+The program saves nothing. The return of an episode is about -1200 for a random policy, and -150 if the pendulum is
+swung up and held.
 """
 
 import argparse

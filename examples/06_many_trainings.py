@@ -1,5 +1,6 @@
 """Compare agents on several tasks and seeds: run a sweep, and write an interactive report.
 
+    pip install -c constraints.txt -e .                 # in a clone of the repository
     python examples/06_many_trainings.py                # 12 seeds in total: 40 minutes on two cores
     python examples/06_many_trainings.py --quick        # 2 seeds, agents without memory: 67 s of CPU time, on two cores
     python examples/06_many_trainings.py --ray auto     # on a Ray cluster
@@ -15,7 +16,7 @@ import beliefrl
 
 
 def main(quick: bool = False, ray: str = "") -> None:
-    """Train VRM and an agent without memory on two pendulums, one without positions, one without velocity."""
+    """Train VRM and an agent without memory on two pendulums, one with hidden angle and one with hidden velocity."""
     tasks = ["pendulum-v", "pendulum-p"]
     if quick:
         out, short = pathlib.Path("runs/many-quick"), {"steps": 600, "step_start_rl": 300, "pretrain_updates": 100}

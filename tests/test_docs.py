@@ -156,7 +156,7 @@ def test_every_example_is_shown():
     assert sorted(shown) == sorted(path.name for path in (ROOT / "examples").glob("*.py"))
 
 
-def test_the_picture_of_the_rooms_is_drawn_from_the_imports():
+def test_the_picture_of_the_parts_is_drawn_from_the_imports():
     house = runpy.run_path(str(DOCS / "house.py"))
     assert house["PICTURE"].read_text() == house["draw"](house["read"]())
 

@@ -1,7 +1,7 @@
-"""What there is, by name: agents, tasks, and the Gymnasium environments whose velocities are known.
+"""The names of agents, tasks and known environments.
 
-Nothing here imports JAX, so the command line lists names at once. What an agent or a task says of itself is read from
-the source of its class.
+Nothing here imports JAX, so the command line lists names at once. Descriptions of agents and tasks are read from the
+source of their classes. A known environment is a Gymnasium environment whose velocities are known.
 """
 
 import ast
@@ -18,11 +18,11 @@ TASK_GROUP = "beliefrl.tasks"
 
 
 class Named(NamedTuple):
-    """What an agent's name stands for."""
+    """An agent's class and settings."""
 
     path: str  # module:Class
-    about: str = ""  # empty: the first line of the class's docstring
-    hyperparameters: dict[str, Any] = {}  # that differ from the class's defaults
+    about: str = ""  # description; empty: the first line of the class's docstring
+    hyperparameters: dict[str, Any] = {}  # those that differ from the class's defaults
 
 
 VRM = "beliefrl.agents.vrm:VRMAgent"
@@ -48,13 +48,13 @@ MASKS = {"-v": "velocities", "-p": "positions"}
 
 
 def agent_names() -> dict[str, str]:
-    """Every agent's name with a sentence on it: ours, then those of installed packages, which are not imported."""
+    """The name and a description of every agent: ours, then those of installed packages, which are not imported."""
     ours = {name: agent.about or written(agent.path)["__doc__"] for name, agent in AGENTS.items()}
     return ours | _declared(AGENT_GROUP, ours)
 
 
 def check_agent(name: str) -> None:
-    """Raise a UserError where no agent has that name. A `module:Class` is not imported, so it may be no agent."""
+    """Raise a UserError if there is no agent of that name. A `module:Class` is not imported, and so not checked."""
     if name in AGENTS or ":" in name:
         return
     there = agent_names()
@@ -94,9 +94,10 @@ def environment_names() -> dict[str, str]:
 
 @functools.cache
 def written(path: str) -> dict[str, Any]:
-    """What stands in the source of a class of ours, module:Class: its constants, and its docstring's first line.
+    """The literal attributes and the docstring of one of our classes, module:Class, read from its source.
 
-    A dictionary {name: value} of those annotated attributes that are literals, and "__doc__". Imports nothing.
+    Returns {name: value} of the annotated attributes with literal values, and the first line of the docstring as
+    "__doc__". Imports nothing.
     """
     module, _, name = path.partition(":")
     file = pathlib.Path(__file__).parent.joinpath(*module.split(".")[1:]).with_suffix(".py")
@@ -117,7 +118,7 @@ def _declared(group: str, ours: dict[str, str]) -> dict[str, str]:
 
 
 def _masked(name: str, about: str, velocities: tuple[int, ...], positions: tuple[int, ...]) -> dict[str, str]:
-    """The description of a task, and of its versions with part of the observation."""
+    """The description of a task, and of its versions that observe a part of the observation."""
     listed = {name: about}
     if velocities:
         listed[f"{name}-v"] = f"{name}, velocities only: entries {_listed(velocities)} of its observation"

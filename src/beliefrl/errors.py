@@ -1,4 +1,4 @@
-"""A user's mistake, and how text from elsewhere is quoted in its message. Imports nothing slow."""
+"""Errors for mistakes of a user, and functions that quote text from elsewhere in a message. Imports nothing slow."""
 
 import re
 from typing import Any
@@ -15,7 +15,7 @@ class UsageError(Exception):
 
 
 def said(error: BaseException) -> str:
-    """An exception of other code, quoted on one line, without control characters."""
+    """The type and message of an exception of other code, on one line, without control characters."""
     text = one_line(str(error))[:300].rstrip(".")
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
@@ -27,6 +27,6 @@ def one_line(text: str) -> str:
 
 
 def short(value: Any) -> str:
-    """How a value is written, on one line of at most 80 characters."""
+    """The repr of a value, on one line of at most 80 characters."""
     text = one_line(repr(value))
     return text if len(text) <= 80 else f"{text[:77]}..."

@@ -1,4 +1,4 @@
-"""Classes that are not in this library, by name: `module:Class`, and the entry points of installed packages."""
+"""Find classes outside of this library by name: `module:Class`, and entry points of installed packages."""
 
 import difflib
 import functools
@@ -12,16 +12,16 @@ from typing import Any
 
 from beliefrl.errors import UserError, one_line, said
 
-NAME = re.compile(r"\w[\w.-]*")  # of an entry point; a module:Class is none
+NAME = re.compile(r"\w[\w.-]*")  # of an entry point; module:Class does not match
 
 
 def load(name: str) -> type:
-    """The class that `module:Class` names; imports the module.
+    """Import the module of `module:Class`, and return the class.
 
-    Only a user may name it, never a file: importing a module runs its code.
+    The name must come from the user, never from a file, because importing a module runs its code.
 
     Raises:
-        UserError: the name is of another form, the module cannot be imported, or it has no such class.
+        UserError: the name has another form, the module cannot be imported, or it has no such class.
     """
     shown = one_line(name)
     module, _, qualname = name.partition(":")
@@ -29,7 +29,7 @@ def load(name: str) -> type:
         raise UserError(f"{shown!r} names no class: write MODULE:CLASS, such as my_module:MyClass.")
     try:
         imported = importlib.import_module(module)
-    except (Exception, SystemExit) as error:  # whatever a module of a user's may raise
+    except (Exception, SystemExit) as error:  # a user's module may raise anything
         raise UserError(f"The module {one_line(module)} cannot be imported: {said(error)}.") from None
     found = _attribute(imported, qualname)
     if not isinstance(found, type):
@@ -41,7 +41,7 @@ def load(name: str) -> type:
 
 
 def path(kind: type) -> str:
-    """The name of a class for `load`; a class of the program itself is in the module that its file would be."""
+    """The name of a class for `load`. For a class of the main program, the module is named after its file."""
     module = kind.__module__
     if module == "__main__":
         main = sys.modules["__main__"]
@@ -51,22 +51,22 @@ def path(kind: type) -> str:
 
 
 def is_named(kind: type, name: str) -> bool:
-    """Whether `name` is the path of a class, or what a notebook records of it."""
+    """Whether `name` is the name of a class as `path` gives it, or as a run records it in a notebook."""
     return name in (path(kind), f"__main__:{kind.__qualname__}")
 
 
 def declared(group: str, but: Container[str] = ()) -> dict[str, str]:
-    """The entry points of a group that installed packages declare: {name: module:Class}. Imports none of them.
+    """The entry points of a group in all installed packages: {name: module:Class}. Imports none of them.
 
-    Left out are names in `but`, and names that are not letters, digits, _, . and -. Of packages that declare the same
-    name the first on sys.path counts.
+    Names in `but`, and names with other characters than letters, digits, _, . and -, are left out. If several packages
+    declare the same name, the first on sys.path counts.
     """
     found: dict[str, str] = {}
-    # The command line adds "" to sys.path for what the user names. What lies in that folder is not installed.
+    # The command line adds "" to sys.path, for modules that the user names. Packages in that folder are not installed.
     for distribution in metadata.distributions(path=[folder for folder in sys.path if folder]):
         try:
             points = distribution.entry_points.select(group=group)
-        except (TypeError, ValueError):  # an entry_points.txt that cannot be read
+        except (TypeError, ValueError):  # its entry_points.txt cannot be read
             continue
         for point in points:
             if NAME.fullmatch(point.name) and point.name not in but:
@@ -75,10 +75,10 @@ def declared(group: str, but: Container[str] = ()) -> dict[str, str]:
 
 
 def load_declared(group: str, name: str, value: str) -> type:
-    """The class of an entry point, NAME = VALUE; imports its module.
+    """Import the module of an entry point, NAME = VALUE, and return its class.
 
     Raises:
-        UserError: it is broken.
+        UserError: the entry point is broken.
     """
     try:
         return load(value)
@@ -87,7 +87,7 @@ def load_declared(group: str, name: str, value: str) -> type:
 
 
 def declared_name(group: str, kind: type, but: Container[str] = ()) -> str | None:
-    """The name of the entry point that is this class, if one is; imports nothing."""
+    """The name of this class's entry point, or None. Imports nothing."""
     for name, value in declared(group, but).items():
         module, _, qualname = value.partition(":")
         if _attribute(sys.modules.get(module), qualname) is kind:
@@ -96,5 +96,5 @@ def declared_name(group: str, kind: type, but: Container[str] = ()) -> str | Non
 
 
 def _attribute(module: Any, qualname: str) -> Any:
-    """What a module has under a name with dots; None where it has nothing."""
+    """The attribute with a dotted name; None if it does not exist."""
     return functools.reduce(lambda found, part: getattr(found, part, None), qualname.split("."), module)

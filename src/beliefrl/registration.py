@@ -1,4 +1,4 @@
-"""Our tasks in Gymnasium's registry: `gymnasium.make("BeliefRL/PendulumV-v0")`, without importing JAX before that."""
+"""Register our tasks in Gymnasium: `gymnasium.make("BeliefRL/PendulumV-v0")`. JAX is imported only by that call."""
 
 import sys
 from importlib.machinery import ModuleSpec
@@ -33,9 +33,9 @@ def register() -> None:
 
 
 class _WhenImported:
-    """A finder of `sys.meta_path` that registers our tasks once Gymnasium is imported, by whatever module.
+    """A finder of `sys.meta_path` that registers our tasks when any module imports Gymnasium.
 
-    To import Gymnasium here would delay the command line by a quarter of a second.
+    Importing Gymnasium here would delay the command line by a quarter of a second.
     """
 
     @classmethod
@@ -56,7 +56,7 @@ class _WhenImported:
 
 
 def register_when_imported() -> None:
-    """Register our tasks now if Gymnasium is imported already, or else when it is."""
+    """Register our tasks now if Gymnasium is already imported, otherwise when it is imported."""
     if "gymnasium" in sys.modules:
         register()
     else:

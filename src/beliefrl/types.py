@@ -1,7 +1,7 @@
-"""The words that the whole library shares: a timestep, a window of timesteps, a task's sizes, a user's mistake.
+"""The types that the whole library shares: a timestep, a window of timesteps, a task's sizes, a user's mistake.
 
 Axis names in shapes, everywhere: `seed` (one training each), `batch` (windows), `time` (timesteps of a window),
-`obs`, `action`, `belief` (what the controller reads), `d` (recurrent state), `z` (latent variable), `x` (perception).
+`obs`, `action`, `belief` (input of the controller), `d` (recurrent state), `z` (latent variable), `x` (perception).
 """
 
 import dataclasses
@@ -24,10 +24,10 @@ WIDEST = 100_000  # layer or state of a network
 
 
 def check_range(settings: Any, names: Sequence[str], low: int | float, high: int | float = LARGEST) -> None:
-    """Raise a UserError where a field of a dataclass, or an entry of a tuple there, is no number in [low, high].
+    """Raise a UserError if a field of a dataclass, or an entry of a tuple field, is not a number in [low, high].
 
-    A field that is declared as int takes whole numbers only; one that is declared as a tuple takes tuples of the
-    declared length only. NaN is in no range; True and False are no numbers.
+    A field of type int accepts only whole numbers. A field of a tuple type accepts only tuples of the declared length.
+    NaN lies in no range. True and False do not count as numbers.
     """
     declared = {field.name: field.type for field in dataclasses.fields(settings)}
     for name in names:
@@ -51,7 +51,7 @@ def _is_number(value: Any, whole: bool) -> bool:
 
 
 def check_indices(indices: Sequence[Any], size: int) -> None:
-    """Raise a UserError where `indices` are not different entries of an observation of `size` numbers, at least one."""
+    """Raise a UserError unless `indices` holds at least one index of an observation with `size` entries, each once."""
     allowed = f"give indices from 0 to {size - 1}."
     for position, index in enumerate(indices):
         if not (_is_number(index, whole=True) and 0 <= index < size):
@@ -65,7 +65,7 @@ def check_indices(indices: Sequence[Any], size: int) -> None:
 
 
 def tuples(values: Mapping[str, Any]) -> dict[str, Any]:
-    """JSON's lists, also lists in lists, as the tuples that they stand for."""
+    """The same values with tuples in place of lists, also inside lists. JSON writes tuples as lists."""
 
     def frozen(value: Any) -> Any:
         return tuple(map(frozen, value)) if isinstance(value, list) else value
@@ -74,7 +74,7 @@ def tuples(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def check_choice(settings: object, name: str, choices: Sequence[str | bool]) -> None:
-    """Raise a UserError where a field of `settings` is none of the choices."""
+    """Raise a UserError if a field of `settings` is not one of the choices."""
     if getattr(settings, name) not in choices:
         raise UserError(
             f"{name}={getattr(settings, name)!r} is impossible: it must be {' or '.join(map(str, choices))}."
@@ -82,19 +82,19 @@ def check_choice(settings: object, name: str, choices: Sequence[str | bool]) -> 
 
 
 class Spec(NamedTuple):
-    """The sizes of a task, all that an agent learns of it beforehand."""
+    """The sizes of a task. An agent knows nothing else about it before training."""
 
     obs_dim: int  # numbers in an observation
     action_dim: int  # degrees of freedom; every action lies in [-1, 1]
     max_steps: int  # time limit of an episode: it truncates, it does not terminate
-    has_success: bool = False  # whether an episode can succeed, besides its return
+    has_success: bool = False  # whether the task says if an episode was successful
 
 
 class Timestep(NamedTuple):
-    """One timestep: what is perceived at t, and what was done just before it.
+    """One timestep: the observation at t, and the action and the reward just before it.
 
-    Two neighbouring timesteps are a transition (o_t, a_t, r_t, o_{t+1}) unless the second is_first:
-    a_t is the second's prev_action, r_t its reward. An episode's last observation is a timestep too.
+    Two neighbouring timesteps form a transition (o_t, a_t, r_t, o_{t+1}), unless the second has is_first. a_t is the
+    prev_action of the second, and r_t its reward. The last observation of an episode is a timestep too.
     """
 
     obs: Float[Array, "*batch obs"]  # o_t
@@ -110,32 +110,32 @@ def perception(step: Timestep) -> Float[Array, "*batch x"]:
 
 
 class StoredTimestep(NamedTuple):
-    """What the replay keeps of a timestep: the step, and the agent's own note of it (any pytree, may be empty)."""
+    """An entry of the replay: a timestep, and the agent's note on it (any pytree, may be empty)."""
 
     step: Timestep
     note: Any
 
 
 class Window(NamedTuple):
-    """Windows of consecutive timesteps as the replay returns them; is_first is also set at the oldest one stored."""
+    """Windows of consecutive timesteps from the replay. is_first is also set at the oldest stored timestep."""
 
     step: Timestep  # leaves (time, batch, ...)
     note: Any
-    exists: Bool[Array, "time *batch"]  # False where the window overhangs what is stored
+    exists: Bool[Array, "time *batch"]  # False outside of the stored timesteps
 
     def between(self, start: int, stop: int | None) -> "Window":
-        """The timesteps from `start` to `stop`, as slices count them."""
+        """The timesteps from `start` to `stop`, as in a slice."""
         return jax.tree.map(lambda leaf: leaf[start:stop], self)
 
 
 class WindowShape(NamedTuple):
-    """How an agent samples: `burn_in` timesteps, then `length` transitions, so burn_in + length + 1 timesteps."""
+    """The length of a window: `burn_in` timesteps, then `length` transitions, so burn_in + length + 1 timesteps."""
 
     burn_in: int
     length: int
 
 
 def transitions(window: Window, burn_in: int) -> Bool[Array, "length *batch"]:
-    """Which neighbours after the burn-in are transitions; (time, ...) gives (time - burn_in - 1, ...)."""
+    """Whether each pair of neighbouring timesteps after the burn-in is a transition."""
     now, after = window.exists[burn_in:-1], window.exists[burn_in + 1 :]
     return now & after & ~window.step.is_first[burn_in + 1 :]

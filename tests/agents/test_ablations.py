@@ -71,8 +71,7 @@ def deterministic():
 def test_a_deterministic_model_predicts_before_it_sees(deterministic):
     """z_t and the prediction of x_t come from d_{t-1} and a_{t-1}; x_t enters d_t. No key changes anything."""
     _, state, window = deterministic
-    timesteps = window
-    changed = timesteps.step._replace(obs=timesteps.step.obs.at[5].add(1.0))
+    changed = window.step._replace(obs=window.step.obs.at[5].add(1.0))
 
     @jax.jit
     def infer(step, key):
@@ -80,7 +79,7 @@ def test_a_deterministic_model_predicts_before_it_sees(deterministic):
         noise = jax.random.normal(key, (*step.reward.shape, 4))
         return vrm.infer(vrm.start(noise.shape[1]), perception(step), step.prev_action, step.is_first, noise)
 
-    one, other = infer(timesteps.step, jax.random.key(1)), infer(changed, jax.random.key(2))
+    one, other = infer(window.step, jax.random.key(1)), infer(changed, jax.random.key(2))
     np.testing.assert_allclose(one.z[:6], other.z[:6], rtol=1e-6)
     np.testing.assert_allclose(one.state.d[:5], other.state.d[:5], rtol=1e-6)
     assert not np.allclose(one.state.d[5], other.state.d[5])
@@ -90,8 +89,7 @@ def test_a_deterministic_model_predicts_before_it_sees(deterministic):
 def test_a_deterministic_models_loss_is_its_mean_squared_error(deterministic):
     agent, state, window = deterministic
     window = jax.tree.map(lambda leaf: leaf[:, :2], window)
-    vrm, timesteps = state.keep, window.between(0, -1)
-    step = timesteps.step
+    vrm, step = state.keep, window.between(0, -1).step
 
     @jax.jit
     def predicted():

@@ -13,7 +13,7 @@ from beliefrl import agents
 from beliefrl.agents.vrm import VRMAgent
 from beliefrl.models.nets import initial_statistics, standardise
 from beliefrl.models.variational_model import VRM
-from beliefrl.types import Timestep, UserError, Window, check_choice
+from beliefrl.types import Timestep, UserError, Window, check_choice, perception
 
 AGENT = VRMAgent(**SMALL)
 
@@ -111,9 +111,8 @@ def test_pretraining_trains_the_first_impression_model_alone(state):
 
 @jax.jit
 def infer(vrm, window, noise):
-    timesteps = window
-    x = jnp.concatenate([timesteps.step.obs, timesteps.step.reward[..., None]], axis=-1)
-    return vrm.infer(vrm.start(noise.shape[1]), x, timesteps.step.prev_action, timesteps.step.is_first, noise)
+    step = window.step
+    return vrm.infer(vrm.start(noise.shape[1]), perception(step), step.prev_action, step.is_first, noise)
 
 
 def test_an_episode_inside_a_window_begins_with_an_empty_memory(state):
@@ -130,18 +129,15 @@ def test_an_episode_inside_a_window_begins_with_an_empty_memory(state):
 def test_the_burn_in_and_the_sequence_are_one_unroll(state):
     window = windows(jax.random.key(1), 3)
     noise = jax.random.normal(jax.random.key(2), (11, 3, AGENT.z_size))
-    timesteps = window
-    x = jnp.concatenate([timesteps.step.obs, timesteps.step.reward[..., None]], axis=-1)
     whole = infer(state.keep, window, noise)
     start = jax.tree.map(lambda leaf: leaf[3], whole.state)
-    rest = jax.jit(VRM.infer)(
-        state.keep, start, x[4:], timesteps.step.prev_action[4:], timesteps.step.is_first[4:], noise[4:]
-    )
+    step = window.between(4, None).step
+    rest = jax.jit(VRM.infer)(state.keep, start, perception(step), step.prev_action, step.is_first, noise[4:])
     np.testing.assert_allclose(rest.state.d, whole.state.d[4:], rtol=1e-5, atol=1e-6)
 
 
 def test_acting_forms_the_belief_that_replay_forms(state):
-    """Moment by timestep as an actor and at once as the replay: the same d, with the same z."""
+    """One timestep after the other as in acting, and all at once as in the replay: the same d, with the same z."""
     window = windows(jax.random.key(1), 1)
     at_once = infer(state.keep, window, jnp.zeros((11, 1, AGENT.z_size)))
     memory, mode, act = AGENT.reset(SPEC), jnp.array(False), jax.jit(AGENT.act)
@@ -203,8 +199,7 @@ def test_a_recomputed_first_impression_is_the_stored_one_up_to_its_sample(state)
     recompute = dataclasses.replace(AGENT, store_first_impression=False)
     window = windows(jax.random.key(1), 10)
     key_first, _ = jax.random.split(jax.random.key(2))
-    timesteps = window
-    d_first = jax.jit(AGENT.unroll)(state.first, timesteps, AGENT.noise(key_first, timesteps)).d
+    d_first = jax.jit(AGENT.unroll)(state.first, window, AGENT.noise(key_first, window)).d
     stored = jax.jit(AGENT.batches)(state, window._replace(note=(d_first,)), jax.random.key(2))
     again = jax.jit(recompute.batches)(state, window._replace(note=()), jax.random.key(2))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), stored, again)

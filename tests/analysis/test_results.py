@@ -9,7 +9,7 @@ import pytest
 
 from beliefrl import agents, cli
 from beliefrl.analysis import groups, results
-from beliefrl.analysis.elbo import model_loss
+from beliefrl.analysis.elbo import draw_elbo, model_loss
 from beliefrl.report import write_report
 from beliefrl.types import UserError
 from written import HOUR, a_folder, a_run, flat
@@ -60,6 +60,15 @@ def test_updates_are_kept_as_the_models_loss_between_evaluations(tmp_path):
     ]
     before, after = (model_loss(groups.groups([each])[0]) for each in (run, kept))
     np.testing.assert_array_equal(after.seeds, before.seeds)
+
+
+def test_the_loss_of_a_model_that_predicts_without_an_elbo_is_kept_and_drawn(tmp_path):
+    updates = [(5, {"loss_model": 8.0}), (10, {"loss_model": 6.0})]
+    (kept,) = packed(
+        tmp_path / "kept.json.gz", a_run(tmp_path / "run", [flat(1.0)], updates=updates, agent="predictive-sac")
+    )
+    assert draw_elbo(groups.groups([kept]), tmp_path / "elbo.png").exists()
+    np.testing.assert_array_equal(model_loss(groups.groups([kept])[0]).seeds, [[7.0]])
 
 
 def test_a_seed_that_diverged_and_a_run_that_goes_on_are_kept_as_they_are(tmp_path):

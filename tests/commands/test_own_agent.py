@@ -63,7 +63,7 @@ def test_it_is_trained_resumed_and_read(folder, capsys):
     capsys.readouterr()
     cli.main(f"evaluate run --episodes 1 --json --agent {OWN}".split())
     assert json.loads(capsys.readouterr().out)["episodes"] == 1
-    assert "has no model to predict with" in complaint(capsys, f"predict run --agent {OWN}")
+    assert "offers no predictions" in complaint(capsys, f"predict run --agent {OWN}")
     assert "was trained with cycle=2, not 4" in complaint(capsys, f"{TRAIN} --steps 24 --cycle 4 --resume")
 
 

@@ -1,4 +1,4 @@
-"""Our networks and losses give the numbers that the authors' code gave (tests/golden, toy sizes, PyTorch's layout)."""
+"""Our networks and losses give the numbers of the authors' code (tests/models/golden, toy sizes, PyTorch's layout)."""
 
 import pathlib
 from functools import partial

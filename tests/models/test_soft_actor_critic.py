@@ -82,7 +82,7 @@ def test_the_mean_counts_what_is_valid_and_is_zero_where_nothing_is():
     assert float(mean(x, jnp.zeros(3, bool))) == 0.0
 
 
-def test_rows_that_are_not_valid_and_values_after_a_terminal_moment_enter_no_loss(controller, batch):
+def test_rows_that_are_not_valid_and_values_after_a_terminal_timestep_enter_no_loss(controller, batch):
     valid, terminated = batch.valid[:, None], batch.terminated[:, None]
     other = batch._replace(
         belief=jnp.where(valid, batch.belief, 3.0),

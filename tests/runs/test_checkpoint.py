@@ -102,7 +102,7 @@ def test_a_larger_ring_takes_what_a_smaller_one_held(three):
     assert not found.timesteps["obs"][0, 5:].any()
 
 
-def test_moments_that_have_changed_are_written_anew(tmp_path):
+def test_timesteps_that_have_changed_are_written_anew(tmp_path):
     checkpoints, ring = Checkpoints(tmp_path, keep=1), Ring()
     ring.add(4, 4)
     saved(checkpoints, ring, 1)
@@ -152,7 +152,7 @@ def test_a_damaged_checkpoint_is_passed_over_for_the_one_before(three, harm, fil
 
 
 @pytest.mark.parametrize("harm", [flip, cut, os.unlink])
-def test_damaged_moments_are_known(three, harm):
+def test_damaged_timesteps_are_known(three, harm):
     folder, rings = three
     harm(sorted((folder / "checkpoints" / "replay").iterdir())[-1])
     found = restored(folder)

@@ -114,7 +114,7 @@ def test_a_failure_is_reported_and_the_others_continue(tmp_path, monkeypatch):
     assert Pretence.started == ["vrm-pendulum-seed0"]
 
 
-def test_a_sweep_that_is_stopped_says_how_to_go_on(tmp_path):
+def test_a_sweep_that_is_stopped_says_how_to_go_on(tmp_path, capsys):
     def stop(status):
         if len(status.finished) == 2:
             os.kill(os.getpid(), signal.SIGINT)
@@ -122,6 +122,7 @@ def test_a_sweep_that_is_stopped_says_how_to_go_on(tmp_path):
     with pytest.raises(Stopped, match=r"stopped with 2 of 4 trainings finished; `beliefrl sweep --out") as stopped:
         sweep(TWO, tmp_path, workers=2, report=stop)
     assert stopped.value.exit_code == 130
+    assert "trainings finished in" not in capsys.readouterr().out  # the count is only in the message
     assert len(sweep([], tmp_path).finished) == 4
     assert len(Pretence.started) == 4
 

@@ -95,7 +95,7 @@ def test_starts_are_uniform():
     assert np.abs(drawn[:possible] / drawn.sum() * possible - 1).max() < 0.2
 
 
-def test_history_and_annotate_address_the_first_moments():
+def test_history_and_annotate_address_the_first_timesteps():
     replay = filled(64, [True, False, False, True, False])
     steps, exists = ring.history(replay, 8)
     np.testing.assert_array_equal(exists, np.arange(8) < 5)

@@ -13,10 +13,9 @@ STATE = AGENT.init(jax.random.key(0), Counting().spec)
 
 def advanced(task, steps, key=0):
     """The replay after some steps, as numpy, and what the steps reported of episodes."""
-    state = STATE
 
     def step(carry, key):
-        actor, replay, episode = rollout.advance(AGENT, task, state, *carry, key)
+        actor, replay, episode = rollout.advance(AGENT, task, STATE, *carry, key)
         return (actor, replay), episode
 
     @jax.jit
@@ -77,15 +76,14 @@ def test_success_is_reported_where_the_episode_ends():
 
 
 @pytest.mark.parametrize("steps", [10, 14])
-def test_reliving_restores_notes_and_memory(steps):
+def test_a_refresh_restores_notes_and_memory(steps):
     timesteps, _, actor = advanced(Counting(), steps)
     replay = ring.init(rollout.stored(AGENT, actor), 64)
     blank = jax.tree.map(lambda ring, new: ring.at[: new.shape[0]].set(new), replay.timesteps, timesteps)
     blank = blank._replace(note=jax.tree.map(lambda note: note * 0 - 9, blank.note))
     replay = ring.Replay(blank, jnp.array(timesteps.step.reward.shape[0]))
     spec = Counting().spec
-    state = STATE
-    again, replay = jax.jit(lambda a, r: rollout.refresh(AGENT, spec, state, a, r, jax.random.key(1), 20))(
+    again, replay = jax.jit(lambda a, r: rollout.refresh(AGENT, spec, STATE, a, r, jax.random.key(1), 20))(
         actor, replay
     )
     np.testing.assert_array_equal(replay.timesteps.note[0][: len(timesteps.note[0])], timesteps.note[0])
@@ -94,9 +92,8 @@ def test_reliving_restores_notes_and_memory(steps):
 
 def test_evaluation_plays_whole_episodes_and_stops_counting_at_their_end():
     explore = jnp.array([True, True, False])
-    state = STATE
     for task, total, length in ((Counting(), 28, 7), (Counting(ends=4), 10, 4)):
-        result = jax.jit(lambda key, task=task: rollout.evaluate(AGENT, task, state, key, explore))(jax.random.key(0))
+        result = jax.jit(lambda key, task=task: rollout.evaluate(AGENT, task, STATE, key, explore))(jax.random.key(0))
         assert result.done.all()
         np.testing.assert_array_equal(result.episode_return, total)
         np.testing.assert_array_equal(result.length, length)

@@ -21,7 +21,7 @@ def player(task=TASK, name="sac-lstm", rendered=False):
 
 
 @pytest.mark.parametrize(("ends", "last"), [(1000, 7), (4, 4)])
-def test_every_moment_is_where_it_belongs(ends, last):
+def test_every_timestep_is_where_it_belongs(ends, last):
     agent, task = CountingAgent(), Counting(ends)
     steps, total, success, frames = Player(agent, task, agent.init(jax.random.key(0), task.spec)).play()
     assert steps.obs.ravel().tolist() == list(range(last + 1))
@@ -55,7 +55,7 @@ def test_a_seed_is_an_episode():
     assert not np.allclose(mode.steps.prev_action, sample.steps.prev_action)
 
 
-def test_frames_are_of_the_moments_asked_for_and_the_last():
+def test_frames_are_of_the_timesteps_asked_for_and_the_last():
     with player(rendered=True) as playing:
         frames = playing.play(0, at={0, 2}).frames
         assert list(frames) == [0, 2, 6]

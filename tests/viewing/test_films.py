@@ -105,7 +105,7 @@ def test_an_mp4_without_its_encoder_is_told_in_a_sentence(tmp_path, run, monkeyp
         films.video(run, tmp_path / "film.mp4")
 
 
-def test_a_strip_is_evenly_spaced_from_the_first_moment_to_the_last(run):
+def test_a_strip_is_evenly_spaced_from_the_first_timestep_to_the_last(run):
     assert list(films._strip(run, 3, None, 0, False, None, None, None).frames) == [0, 2, 5]
     assert list(films._strip(run, 8, None, 0, False, 3, None, None).frames) == [0, 1, 2, 3]
 

@@ -169,7 +169,7 @@ def test_a_short_episode_is_seen_to_its_half(tmp_path):
 @pytest.mark.parametrize(
     ("name", "changes", "sentence"),
     [
-        ("sac-mlp", {}, "is a run of sac-mlp, which has no model to predict with"),
+        ("sac-mlp", {}, "is a run of sac-mlp, which offers no predictions"),
         ("sac-lstm", {}, "is a run of sac-lstm, which has no model"),
         ("vrm-keep", {"model": "first"}, "vrm-keep has no model 'first': it has keep"),
         ("slac", {"model": "keep"}, "slac has no model 'keep': it has latent"),

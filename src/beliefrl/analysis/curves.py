@@ -1,40 +1,25 @@
 """The learning curve of a run: mean and standard error over seeds (Figures 4 and 6)."""
 
 import pathlib
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from beliefrl.analysis.figures import figure
-from beliefrl.runs.run import Row, Run
+from beliefrl.analysis.groups import Curve, Group, task_of
+from beliefrl.runs.run import Run
 from beliefrl.types import UserError
 
 COLOURS = {"sampled": "#1f6f8b", "mode": "#c8553d"}
 
 
-def evaluations(run: Run, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Steps (evaluation,) that all seeds have reached, and an entry's mean for each seed (seed, evaluation).
-
-    A diverged seed has NaN from its divergence on, and does not shorten the curve of the others.
-    """
-    seeds = [{row["step"]: float(np.mean(row[name])) for row in run.rows(seed, "evaluation")} for seed in run.seeds]
-    healthy = [means for means, seed in zip(seeds, run.seeds, strict=True) if not any(run.rows(seed, "diverged"))]
-    steps = sorted(set.intersection(*map(set, healthy or seeds)))
-    table = [[seed.get(step, np.nan) for step in steps] for seed in seeds]
-    return np.array(steps), np.array(table).reshape(len(seeds), -1)
-
-
-def means_between(updates: Sequence[Row], name: str, steps: Sequence[int]) -> np.ndarray:
-    """The mean of an entry over the updates since the previous one of `steps` (step,); NaN where there is no update."""
-    rows = [row for row in updates if name in row]
-    at, values = np.array([row["step"] for row in rows]), np.array([row[name] for row in rows], float)
-    within = [values[(at > low) & (at <= high)] for low, high in zip([0, *steps], steps, strict=False)]
-    return np.array([part.mean() if part.size else np.nan for part in within])
+def evaluations(run: Run, name: str) -> Curve:
+    """An entry of the evaluations of all seeds of a run, as in `Group.curve`."""
+    return Group(task_of(run), run.config["agent"], [(run, seed) for seed in run.seeds]).curve(name)
 
 
 def standard_error(seeds: np.ndarray) -> np.ndarray:
-    """S.E.M. over the first axis, ignoring NaN; 0 where there is only one value."""
+    """S.E.M. over the first axis, ignoring NaN; 0 if there is only one value."""
     count = np.sum(~np.isnan(seeds), axis=0)
     squares = np.nansum((seeds - np.nanmean(seeds, axis=0)) ** 2, axis=0)
     return np.where(count > 1, np.sqrt(squares / np.maximum(count - 1, 1) / np.maximum(count, 1)), 0.0)
@@ -60,7 +45,7 @@ def curve_figure(run: Run) -> Any:
     Raises:
         UserError: there is no evaluation yet.
     """
-    if not evaluations(run, "sampled")[0].size:
+    if not evaluations(run, "sampled").steps.size:
         raise UserError(f"{run.folder} has no evaluation of every seed yet, so there is no curve to draw.")
     panels = [("return", "")]
     if any("sampled_success" in row for row in run.rows(run.seeds[0], "evaluation")):

@@ -1,16 +1,18 @@
-"""Figure of the return and the negative ELBO of the keep-learning model, on two axes (Section 5.4)."""
+"""Figure of the return and the loss of the model, on two axes (Section 5.4).
+
+For VRM the loss is the negative ELBO of the keep-learning model.
+"""
 
 import pathlib
 from collections.abc import Sequence
 
 import numpy as np
 
-from beliefrl.analysis.curves import means_between
 from beliefrl.analysis.figures import save
 from beliefrl.analysis.groups import Curve, Group
 from beliefrl.analysis.palette import colours
 from beliefrl.analysis.panels import add_legend, draw_line, finish, panels, spread, with_curve
-from beliefrl.analysis.results import MODEL_LOSSES
+from beliefrl.analysis.results import MODEL_LOSSES, means_between
 from beliefrl.types import UserError
 
 GREY = "#444444"
@@ -37,7 +39,7 @@ def draw_elbo(groups: Sequence[Group], out: pathlib.Path, mode: str = "sampled")
     """
     shown = [(group, loss) for group in with_curve(groups, mode) if (loss := model_loss(group)) is not None]
     if not shown:
-        raise UserError("None of these runs has a model that keeps learning: give runs of vrm.")
+        raise UserError("None of these runs has a model that keeps learning: give runs of vrm, slac or predictive-sac.")
     colour = colours([group.label for group, _ in shown])
     lines = {group.label: colour[group.label] for group, _ in shown} | {"loss of the model (dashed)": GREY}
     made, axes = panels(len(shown), [*lines])
@@ -45,7 +47,7 @@ def draw_elbo(groups: Sequence[Group], out: pathlib.Path, mode: str = "sampled")
         draw_line(axis, group.curve(mode), colour[group.label], "return")
         finish(axis, f"{group.label} on {group.task}", "return")
         right = axis.twinx()
-        draw_line(right, loss, GREY, "negative ELBO", linestyle="--")
+        draw_line(right, loss, GREY, "loss of the model", linestyle="--")
         right.set_ylabel("loss of the model (dashed)", fontsize=9)
         right.tick_params(labelsize=8)
         right.spines["top"].set_visible(False)

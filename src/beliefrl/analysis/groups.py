@@ -131,9 +131,8 @@ def groups(runs: Sequence[Run], defaults: Mapping[str, Row] | None = None) -> li
         same_agent = [settings[other.folder] for other in runs if other.config["agent"] == run.config["agent"]]
         same_task = [other.config["constants"] for other in runs if task_of(other) == task_of(run)]
         task = " ".join([task_of(run), *_differences(run.config["constants"], same_task)])
-        label = " ".join(
-            [run.config["agent"], *_differences(settings[run.folder], same_agent, usual[run.config["agent"]])]
-        )
+        own = results.changed(settings[run.folder], usual[run.config["agent"]])
+        label = " ".join([run.config["agent"], *_differences(own, same_agent)])
         of = seeds.setdefault((task, label), {})
         for seed in run.seeds:
             if seed not in of or _precedence(run, seed) > _precedence(of[seed], seed):
@@ -153,10 +152,6 @@ def task_of(run: Run) -> str:
     return run.config["task"] + (f" observe {' '.join(map(str, seen))}" if seen else "")
 
 
-def _differences(settings: Row, others: Sequence[Row], usual: Row | None = None) -> list[str]:
-    """NAME=VALUE of the settings that differ from some of `others` and from `usual`."""
-    return [
-        f"{name}={value}"
-        for name, value in settings.items()
-        if any(other.get(name) != value for other in others) and (not usual or usual.get(name) != value)
-    ]
+def _differences(settings: Row, others: Sequence[Row]) -> list[str]:
+    """NAME=VALUE of the settings that differ from some of `others`."""
+    return [f"{name}={value}" for name, value in settings.items() if any(other.get(name) != value for other in others)]

@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from beliefrl.analysis.curves import means_between
 from beliefrl.runs.arrays import write_whole
 from beliefrl.runs.run import Row, Run
 from beliefrl.types import UserError
@@ -26,7 +25,7 @@ ENDING = ".json.gz"
 FORMAT = 1
 DIGITS = 6  # significant
 KINDS = ("evaluation", "diverged")  # rows that are stored unchanged
-MODEL_LOSSES = ("negative_elbo", "prediction_error")  # names of a model's loss in the logs
+MODEL_LOSSES = ("negative_elbo", "prediction_error", "loss_model")  # names of a model's loss in the logs
 SERIES = (*MODEL_LOSSES, "q")
 
 
@@ -102,11 +101,21 @@ def write(path: pathlib.Path, runs: Sequence[Run], defaults: Mapping[str, Row]) 
         raise UserError(f"{path} cannot be written ({error.strerror}): choose another file.") from None
 
 
+def changed(hyperparameters: Row, defaults: Row) -> Row:
+    """The hyperparameters that differ from their defaults, and those without a default. Both have JSON's types."""
+    return {name: value for name, value in hyperparameters.items() if name not in defaults or defaults[name] != value}
+
+
+def means_between(updates: Sequence[Row], name: str, steps: Sequence[int]) -> np.ndarray:
+    """The mean of an entry over the updates since the previous one of `steps` (step,); NaN if there is no update."""
+    rows = [row for row in updates if name in row]
+    at, values = np.array([row["step"] for row in rows]), np.array([row[name] for row in rows], float)
+    within = [values[(at > low) & (at <= high)] for low, high in zip([0, *steps], steps, strict=False)]
+    return np.array([part.mean() if part.size else np.nan for part in within])
+
+
 def _packed(run: Run, usual: Row) -> dict[str, Any]:
-    missing = object()
-    settings = usual | run.config["hyperparameters"]
-    own = {name: value for name, value in settings.items() if usual.get(name, missing) != value}
-    text = json.dumps(run.config | {"hyperparameters": own})
+    text = json.dumps(run.config | {"hyperparameters": changed(run.config["hyperparameters"], usual)})
     config = json.loads(re.sub(r'"/[^"]*/(runs/[^"]*)"', r'"\1"', text))  # cut absolute paths to runs/...
     return {"name": run.folder.name, "config": config, "rows": {seed: _kept_rows(run, seed) for seed in run.seeds}}
 

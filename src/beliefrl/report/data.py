@@ -14,6 +14,7 @@ from beliefrl import agents
 from beliefrl.analysis.curves import standard_error
 from beliefrl.analysis.groups import Curve, Group, groups, is_finished, last_step
 from beliefrl.analysis.palette import colours, dashes
+from beliefrl.analysis.results import changed
 from beliefrl.analysis.scalability import wall_clock
 from beliefrl.runs.run import Row, Run
 from beliefrl.training.evaluation import MODES
@@ -148,13 +149,11 @@ def settings(config: dict[str, Any]) -> list[str] | None:
     defaults = agents.defaults().get(config["agent"])
     if defaults is None:
         return None
-    missing = object()
-    given = config["hyperparameters"]
-    return [f"{name}={value}" for name, value in given.items() if defaults.get(name, missing) != value]
+    return [f"{name}={value}" for name, value in changed(config["hyperparameters"], defaults).items()]
 
 
 def _session(session: dict[str, Any]) -> dict[str, str]:
-    """When, where and how a session of a training ran, as text."""
+    """Time, device, commit, command and versions of a session of a training, as text."""
     return {
         "started": str(session.get("started", "?")),
         "ended": str(session.get("ended", "?")),

@@ -1,4 +1,4 @@
-"""What is shown of a sweep while it runs."""
+"""The display of a sweep: its trainings and the time left."""
 
 import pathlib
 
@@ -11,9 +11,9 @@ from beliefrl.training.screen import Screen, duration
 
 
 class SweepDisplay:
-    """A live table of what runs, what is left and when it ends; a line for every training that begins or ends.
+    """A live table of the running trainings, with the time left, and a line for each training that begins or ends.
 
-    Where nothing is live, only the lines.
+    On a screen that is not live only the lines are shown.
     """
 
     def __init__(self, screen: Screen, folder: pathlib.Path):
@@ -26,14 +26,14 @@ class SweepDisplay:
         self.screen.__enter__()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self.screen.__exit__()
-        if self.before is not None:
+        if kind is None and self.before is not None:
             done = f"{len(self.before.finished)} of {self.before.count} trainings finished in {self.folder}"
             self.screen.line(f"{done}; `beliefrl report {self.folder} -o report.html` shows them")
 
     def __call__(self, status: SweepStatus) -> None:
-        """Show how far a sweep is."""
+        """Show the state of a sweep."""
         self.forecast.watch(status)
         self._say_changes(status)
         self.screen.status(self._summary(status), self._table(status))

@@ -71,7 +71,7 @@ def environment(sweep: pathlib.Path, slot: Slot) -> dict[str, str]:
     if slot.startswith("gpu"):
         variables["CUDA_VISIBLE_DEVICES"] = slot.removeprefix("gpu")
     elif slot != "-":
-        variables["NPROC"] = "1"  # one XLA thread, where the process cannot be bound to a core
+        variables["NPROC"] = "1"  # one XLA thread, even if the process cannot be bound to a core
     return variables
 
 

@@ -33,11 +33,9 @@ PAPERS = {"lr_model": 8e-4, "seq_len": 64, "batch_size": 4}  # Table 2
 class Preset:
     """A set of experiments of the paper."""
 
-    about: str
     tasks: Sequence[str]
     agents: Sequence[str]
     make: Callable[[Sequence[str], Sequence[str], Sequence[int] | None], list[Experiment]]  # tasks, agents, seeds
-    alone: bool = False  # one training at a time, because the trainings are timed
 
 
 def steps(task: str) -> int:
@@ -76,23 +74,12 @@ def _scalability(tasks: Sequence[str], agents: Sequence[str], seeds: Sequence[in
 
 
 PRESETS = {
-    "classic": Preset("Pendulum and CartPole, four agents, 5 seeds (Section 5.1)", CLASSIC, COMPARED, _compared),
-    "robots": Preset("Hopper, Walker2d, Ant, four agents, 5 seeds (Section 5.2)", ROBOTS, COMPARED, _compared),
-    "memory": Preset("target reaching, four agents, 5 seeds (Section 5.3)", MEMORY, COMPARED, _compared),
-    "ablation": Preset("VRM and its ablations on all tasks, 5 seeds (Appendix C)", EVERY, ABLATIONS, _compared),
-    "sensitivity": Preset(
-        "VRM with the paper's settings and with drawn settings, 20 seeds each (Appendix F)",
-        EVERY,
-        ("vrm",),
-        _sensitivity,
-    ),
-    "scalability": Preset(
-        "four agents on velocities-only Hopper, 100,000 steps, timed (Appendix G)",
-        ("hopper-v",),
-        COMPARED,
-        _scalability,
-        True,
-    ),
+    "classic": Preset(CLASSIC, COMPARED, _compared),  # Section 5.1
+    "robots": Preset(ROBOTS, COMPARED, _compared),  # Section 5.2
+    "memory": Preset(MEMORY, COMPARED, _compared),  # Section 5.3
+    "ablation": Preset(EVERY, ABLATIONS, _compared),  # Appendix C
+    "sensitivity": Preset(EVERY, ("vrm",), _sensitivity),  # Appendix F
+    "scalability": Preset(("hopper-v",), COMPARED, _scalability),  # Appendix G; timed, so one training at a time
 }
 
 

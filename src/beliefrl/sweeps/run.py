@@ -53,7 +53,7 @@ def sweep(
         seeds_per_run: most seeds side by side in one program. None: all on a GPU, the fastest number on a CPU.
         ray: address of the head of a Ray cluster (HOST:PORT, or "auto"). None: run on this machine.
         report: called twice a second with the state of the sweep.
-        progress: show what runs, what is left and when it ends: live in a terminal or a notebook, elsewhere as lines.
+        progress: show the running trainings and the time left: live in a terminal or a notebook, otherwise as lines.
 
     Raises:
         UserError: a name, setting or value is impossible (raised before any training starts); another process runs this
@@ -86,7 +86,7 @@ def sweep(
 
 @contextlib.contextmanager
 def _reporting(folder: pathlib.Path, report: Report | None, progress: bool) -> Iterator[Report]:
-    """What is called with every state of the sweep: the display, unless `progress` is False, and `report`."""
+    """Yields a function to call with every state of the sweep. It calls `report`, and the display if `progress`."""
     with contextlib.ExitStack() as stack:
         listeners = [] if report is None else [report]
         if progress:
@@ -98,7 +98,7 @@ def _reporting(folder: pathlib.Path, report: Report | None, progress: bool) -> I
 
 
 def _check_named(folder: pathlib.Path, before: Sequence[Training], experiments: Sequence[Experiment]) -> None:
-    """Refuse to import an agent that only the sweep's folder names."""
+    """Raise a UserError if only the sweep's folder names an agent of the user: such an agent is not imported."""
     named = {experiment.agent for experiment in experiments}
     for training in before:
         if agents.is_own(training.agent) and training.agent not in named:

@@ -1,4 +1,4 @@
-"""Where progress is shown: live in a terminal and in a notebook; elsewhere, such as in a log, as lines that stay."""
+"""Screens that show progress: live in a terminal and in a notebook, and as lines in a log."""
 
 import base64
 import contextlib
@@ -12,7 +12,7 @@ from rich.console import Console, RenderableType
 from rich.live import Live
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-SILENCE = 60.0  # seconds after which a log gets a line in any case
+SILENCE = 60.0  # seconds without a line, after which a log gets the status
 PACE = 0.25  # seconds between two statuses in a notebook
 
 
@@ -26,12 +26,12 @@ def duration(seconds: float) -> str:
 
 
 class Screen:
-    """Progress in a log: only lines. Where none comes for `SILENCE` seconds, the status is printed as one."""
+    """Progress in a log: only lines. After `SILENCE` seconds without a line, the status is printed."""
 
     is_live = False  # whether a status is visible at once
 
     def __init__(self, console: Console, patience: float = SILENCE):
-        """`patience`: seconds before the first status is printed."""
+        """`patience`: seconds without a line before the first status is printed."""
         self.console, self.began = console, time.monotonic()
         self._status, self._printed = "", self.began + patience - SILENCE
         self._is_over = threading.Event()
@@ -57,11 +57,14 @@ class Screen:
         self.console.print(what, markup=False, highlight=False, soft_wrap=isinstance(what, str))
 
     def status(self, text: str, live: RenderableType) -> None:
-        """What happens now; it replaces the status before. `text` goes to a log, `live` to a live screen."""
+        """Replace the status. A log prints `text`, a live screen shows `live`."""
         self._status = text
 
     def picture(self, draw: Callable[[], bytes | None]) -> None:
-        """Where pictures can be shown, draw one (PNG) that replaces the one before; None leaves it."""
+        """If pictures can be shown, show the PNG that `draw` returns in place of the previous one.
+
+        If it returns None, change nothing.
+        """
 
     def _break_silence(self) -> None:
         while not self._is_over.wait(max(self._printed + SILENCE - time.monotonic(), 0.1)):
@@ -88,7 +91,7 @@ class Terminal(Screen):
 
 
 class Notebook(Screen):
-    """Progress in a notebook: a text that is replaced, its last line the status, and a picture under it."""
+    """Progress in a notebook: a text whose end is the status, and a picture below it. Both are replaced in place."""
 
     is_live = True
 
@@ -101,7 +104,7 @@ class Notebook(Screen):
         self._update("")
 
     def show(self, what: RenderableType) -> None:
-        """Add it to the text."""
+        """Add `what` to the text."""
         self._lines += self._text(what)
         self._update("")
 
@@ -137,7 +140,7 @@ class Notebook(Screen):
 
 
 def screen(patience: float = SILENCE) -> Screen:
-    """The screen that this process has. `patience` as in `Screen`."""
+    """The screen of this process. `patience` is as in `Screen`."""
     console = Console()
     kind = Notebook if console.is_jupyter else Terminal if console.is_terminal else Screen
     return kind(console, patience)
@@ -145,7 +148,7 @@ def screen(patience: float = SILENCE) -> Screen:
 
 @contextlib.contextmanager
 def playing(episodes: int) -> Iterator[Callable[[int], None]]:
-    """Show that so many episodes are played; what it yields is called with how many have ended."""
+    """Show the progress of `episodes` episodes. Yields a function to call with the number of finished episodes."""
     shown = screen(patience=3.0)
     columns: Any = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     progress = Progress(*columns, auto_refresh=False)

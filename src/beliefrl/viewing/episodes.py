@@ -132,7 +132,7 @@ def play(
         episode_seed: random seed of the episode and its actions. The same seed gives the same episode.
         sampled: sample the actions, instead of taking the policy's mode.
         steps: stop after this many steps; None: play until the task ends the episode.
-        at: timesteps of which to keep a frame, such as range(0, 1000, 10). The last timestep is added, unless `at` is
+        at: timesteps whose frames are kept, such as range(0, 1000, 10). The last timestep is added, unless `at` is
             empty.
         task: needed only if the run was trained on a task of your own.
         agent: needed only if the run was trained by an agent of your own: its class, or an instance.

@@ -137,7 +137,7 @@ def _model(run: Run, agent: Any, model: str | None) -> str:
     """The name of the model to predict with."""
     if not isinstance(agent, Predictive):
         raise UserError(
-            f"{run.folder} is a run of {run.config['agent']}, which has no model to predict with: use vrm or slac."
+            f"{run.folder} is a run of {run.config['agent']}, which offers no predictions: use vrm or slac."
         )
     if model is not None and model not in agent.predictors:
         has = ", ".join(agent.predictors)
