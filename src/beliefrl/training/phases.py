@@ -221,9 +221,12 @@ class Program(NamedTuple):
     close: Callable[[], None] = lambda: None  # after the last phase
 
 
+RUN_ONCE = {"xla_backend_optimization_level": 0}  # compiles in half the time; the numbers drawn are the same
+
+
 def compile_program(agent: Agent, task: Task, capacity: int, episodes: int) -> Program:
     """The phases as compiled functions. They donate the memory of the seeds that they are given."""
-    start = jax.jit(jax.vmap(partial(begin, agent, task, capacity)))
+    start = jax.jit(jax.vmap(partial(begin, agent, task, capacity)), compiler_options=RUN_ONCE)
     return Program(
         begin=start,
         explore=jax.jit(partial(explore, agent, task), donate_argnums=0),
