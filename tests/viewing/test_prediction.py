@@ -170,7 +170,7 @@ def test_a_short_episode_is_seen_to_its_half(tmp_path):
     ("name", "changes", "sentence"),
     [
         ("sac-mlp", {}, "is a run of sac-mlp, which offers no predictions"),
-        ("sac-lstm", {}, "is a run of sac-lstm, which has no model"),
+        ("sac-lstm", {}, "is a run of sac-lstm, which offers no predictions"),
         ("vrm-keep", {"model": "first"}, "vrm-keep has no model 'first': it has keep"),
         ("slac", {"model": "keep"}, "slac has no model 'keep': it has latent"),
         ("slac", {"start": 13}, "start=13 is impossible: the episode has 13 timesteps, so give 12 or less"),

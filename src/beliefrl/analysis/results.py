@@ -115,7 +115,7 @@ def means_between(updates: Sequence[Row], name: str, steps: Sequence[int]) -> np
 
 
 def _packed(run: Run, usual: Row) -> dict[str, Any]:
-    text = json.dumps(run.config | {"hyperparameters": changed(run.config["hyperparameters"], usual)})
+    text = json.dumps(run.config | {"hyperparameters": changed(usual | run.config["hyperparameters"], usual)})
     config = json.loads(re.sub(r'"/[^"]*/(runs/[^"]*)"', r'"\1"', text))  # cut absolute paths to runs/...
     return {"name": run.folder.name, "config": config, "rows": {seed: _kept_rows(run, seed) for seed in run.seeds}}
 
