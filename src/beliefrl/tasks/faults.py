@@ -59,7 +59,7 @@ class Faults:
         """Raise a UserError for impossible values."""
         given: Any = self.noise
         several = isinstance(given, list | tuple) or getattr(given, "ndim", 0) == 1
-        deviations = tuple(given) if several else (given,)
+        deviations: tuple[Any, ...] = tuple(given) if several else (given,)
         if not deviations or not all(map(_is_deviation, deviations)):
             shown = " ".join(map(str, deviations)) or "()"
             raise UserError(

@@ -64,15 +64,14 @@ class GymnasiumTask:
         environment = self.environment()
         environment.close()
         actions = environment.inner_action_space
-        return Spec(
-            environment.observation_space.shape[0], actions.low.size, environment.limit or LARGEST, self.has_success
-        )
+        size = self.faults.observed_size(environment.indices.size)
+        return Spec(size, actions.low.size, environment.limit or LARGEST, self.has_success)
 
     def environment(self, seed: str = "") -> "Environment":
         """Make one environment, as the agent sees it. `seed` identifies it in the messages of faults.
 
         Raises:
-            UserError: the environment cannot be made, or its spaces are not supported, or the noise does not fit the
+            UserError: the environment cannot be made, its spaces are not supported, or the noise does not fit its
                 observation.
         """
         return Environment(self, seed) if self.faults == NONE else FaultyEnvironment(self, seed)
