@@ -30,7 +30,8 @@ def test_faults_of_the_sensors_are_settings(tmp_path):
     )
     for training, noise in zip(plan(noisy), (["0.0"], ["0.1", "0.2", "0.3"]), strict=True):
         command = training.command(tmp_path)
-        assert command[command.index("--noise") :][: len(noise) + 2] == ["--noise", *noise, "--flicker-flag"]
+        assert command[command.index("--noise") :][: len(noise) + 1] == ["--noise", *noise]
+        assert "--flicker-flag" in command
         assert training.name == f"sac-mlp-pendulum-gamma=0.9-flicker_flag=True-noise={','.join(noise)}-seed0"
     write(tmp_path, plan(noisy))
     assert extended(read(tmp_path), noisy) == read(tmp_path)
