@@ -74,7 +74,7 @@ def print_table(table):
     print("| fault | " + " | ".join(f"`{agent}`" for agent in table) + " |")
     print("| --- |" + " ---: |" * len(table))
     rows = dict.fromkeys(item for measured in table.values() for item in sorted(measured) if item != ("flicker", 0.0))
-    for name, level in sorted(rows):
+    for name, level in sorted(rows, key=lambda item: (item[1] != 0, *item)):
         cells = []
         for measured in table.values():
             final, whole = measured[name, level], np.nanmean(measured["noise", 0.0])
