@@ -23,9 +23,10 @@ if TYPE_CHECKING:
     from beliefrl.runs.run import Run
     from beliefrl.sweeps.plan import Experiment, grid
     from beliefrl.sweeps.run import SweepStatus, sweep
-    from beliefrl.tasks import Task, observe
+    from beliefrl.tasks import Task, observe, with_faults
     from beliefrl.tasks import make as make_task
     from beliefrl.tasks.environment import TaskEnvironment
+    from beliefrl.tasks.faults import Faults
     from beliefrl.tasks.gymnasium import GymnasiumTask
     from beliefrl.training.evaluation import evaluate, task_of
     from beliefrl.training.schedule import Event
@@ -42,6 +43,7 @@ __all__ = [
     "Agent",
     "Event",
     "Experiment",
+    "Faults",
     "GymnasiumTask",
     "Options",
     "Policy",
@@ -74,6 +76,7 @@ __all__ = [
     "task_of",
     "train",
     "video",
+    "with_faults",
     "write_report",
 ]
 
@@ -82,6 +85,7 @@ _HOMES = {
     "Agent": "agents:Agent",
     "Event": "training.schedule:Event",
     "Experiment": "sweeps.plan:Experiment",
+    "Faults": "tasks.faults:Faults",
     "GymnasiumTask": "tasks.gymnasium:GymnasiumTask",
     "Options": "runs.options:Options",
     "Policy": "policy:Policy",
@@ -114,6 +118,7 @@ _HOMES = {
     "task_of": "training.evaluation:task_of",
     "train": "training.train:train",
     "video": "viewing.films:video",
+    "with_faults": "tasks:with_faults",
     "write_report": "report:write_report",
 }
 

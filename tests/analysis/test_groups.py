@@ -32,12 +32,14 @@ def test_agents_tasks_and_settings_are_apart_and_named_by_what_differs(tmp_path)
         a_run(tmp_path / "b", [flat(1.0)], settings={**usual, "gamma": 0.9}),
         a_run(tmp_path / "c", [flat(1.0)], agent="sac-mlp", settings={"tau": 0.1}),
         a_run(tmp_path / "d", [flat(1.0)], task="pendulum", settings=usual, observe=[0, 2]),
+        a_run(tmp_path / "e", [flat(1.0)], settings=usual, faults={"noise": [0.1], "delay": 2}),
     ]
     assert labels(groups(made)) == [
         ("pendulum-v", "vrm gamma=0.99", [0]),
         ("pendulum-v", "vrm gamma=0.9", [0]),
         ("pendulum-v", "sac-mlp", [0]),
         ("pendulum observe 0 2", "vrm gamma=0.99", [0]),
+        ("pendulum-v noise=[0.1] delay=2", "vrm gamma=0.99", [0]),
     ]
 
 

@@ -24,6 +24,21 @@ def test_a_grid_is_every_combination():
     assert all(each.settings["steps"] == 50 and each.seeds == (0, 1) for each in made)
 
 
+def test_faults_of_the_sensors_are_settings(tmp_path):
+    noisy = grid(
+        ["sac-mlp"], ["pendulum"], {"noise": [0.0, [0.1, 0.2, 0.3]], "gamma": [0.9]}, seeds=1, flicker_flag=True
+    )
+    for training, noise in zip(plan(noisy), (["0.0"], ["0.1", "0.2", "0.3"]), strict=True):
+        command = training.command(tmp_path)
+        assert command[command.index("--noise") :][: len(noise) + 1] == ["--noise", *noise]
+        assert "--flicker-flag" in command
+        assert training.name == f"sac-mlp-pendulum-gamma=0.9-flicker_flag=True-noise={','.join(noise)}-seed0"
+    write(tmp_path, plan(noisy))
+    assert extended(read(tmp_path), noisy) == read(tmp_path)
+    with pytest.raises(UserError, match=r"noise=0\.1 0\.2 has 2 deviations"):
+        plan(grid(["sac-mlp"], ["pendulum"], {"noise": [[0.1, 0.2]]}))
+
+
 def test_first_seeds_come_first():
     trainings = plan(grid(["vrm", "slac"], ["pendulum", "cartpole"], seeds=3))
     assert [training.options["seed"] for training in trainings] == [0] * 4 + [1] * 4 + [2] * 4

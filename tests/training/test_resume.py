@@ -17,6 +17,7 @@ from beliefrl.runs.arrays import load as load_arrays
 from beliefrl.runs.arrays import packed
 from beliefrl.runs.checkpoint import _sha256, _signed, listed
 from beliefrl.runs.run import Recorder, Run
+from beliefrl.tasks import make
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.stop import Stopped
 from beliefrl.types import UserError
@@ -68,6 +69,17 @@ def test_a_crashed_training_goes_on_to_the_last_bit(whole, tmp_path, share):
     assert listed(tmp_path / "run")
     resume(tmp_path / "run")
     assert files(tmp_path / "run") == files(folder)
+
+
+@pytest.mark.slow
+def test_faults_of_the_sensors_go_on_to_the_last_bit(tmp_path):
+    task = make("pendulum-v", faults={"noise": 0.1, "flicker": 0.2, "flicker_flag": True, "delay": 2, "sticky": 0.1})
+    events = []
+    train(AGENT, task, tmp_path / "whole", events.append, **OPTIONS)
+    with pytest.raises(Crash):
+        train(AGENT, task, tmp_path / "run", crash_at(len(events) - 2), **OPTIONS)
+    resume(tmp_path / "run")
+    assert files(tmp_path / "run") == files(tmp_path / "whole")
 
 
 def test_a_checkpoint_of_an_older_version_goes_on(whole, tmp_path):

@@ -147,9 +147,11 @@ def _precedence(run: Run, seed: int) -> tuple[int, str]:
 
 
 def task_of(run: Run) -> str:
-    """The name of a task in figures. It includes the observed entries, if the run has selected some."""
+    """The name of a task in figures. It includes the observed entries, if the run has selected some, and the faults."""
     seen = run.config.get("observe")
-    return run.config["task"] + (f" observe {' '.join(map(str, seen))}" if seen else "")
+    observed = ["observe", *map(str, seen)] if seen else []
+    faults = [f"{name}={value}" for name, value in run.config.get("faults", {}).items()]
+    return " ".join([run.config["task"], *observed, *faults])
 
 
 def _differences(settings: Row, others: Sequence[Row]) -> list[str]:

@@ -79,9 +79,10 @@ def named_values(given: Sequence[str], option: str) -> dict[str, Any]:
         name, separator, value = each.partition("=")
         if not (separator and name.isidentifier()):
             raise UsageError(f"{option} {each} cannot be understood: write NAME=VALUE, such as max_episode_steps=500.")
-        if name in ("name", "observe"):  # arguments of `tasks.make` that are not constants
+        if name in ("name", "observe", "faults"):  # arguments of `tasks.make` that are not constants
             raise UsageError(
-                f"{option} {each} is impossible: name and observe are not constants of a task: use TASK and --observe."
+                f"{option} {each} is impossible: name, observe and faults are not constants of a task: use TASK, "
+                "--observe, and options such as --noise."
             )
         try:
             values[name] = json.loads({"True": "true", "False": "false", "None": "null"}.get(value, value))

@@ -23,10 +23,11 @@ def run_table(run: Run, agent: Any) -> Table:
     changed = [f"{name}={value}" for name, value in config["hyperparameters"].items() if _differs(value, own.get(name))]
     constants = [f"{name}={value}" for name, value in config["constants"].items()]
     observed = [] if config.get("observe") is None else [f"observe={' '.join(map(str, config['observe']))}"]
+    faults = [f"{name}={value}" for name, value in config.get("faults", {}).items()]
     steps = [max((row["step"] for row in run.rows(seed) if row["kind"] != "pretrain"), default=0) for seed in run.seeds]
     add("agent", config["agent"])
     add("settings", ", ".join(changed) or "the agent's defaults")
-    add("task", " ".join([config["task"], *constants, *observed]))
+    add("task", " ".join([config["task"], *constants, *observed, *faults]))
     add("seeds", ", ".join(map(str, run.seeds)))
     add("steps", f"{max(steps):,} of {run.options.steps:,}")
     for seed in run.seeds:

@@ -28,6 +28,7 @@ def train(argv: Sequence[str]) -> None:
     catalogue.check_agent(name)  # before JAX is imported
     from beliefrl import agents, tasks
     from beliefrl.runs.options import Options
+    from beliefrl.tasks.faults import Faults
     from beliefrl.training.train import train as run_training
 
     options_type = agent_options(
@@ -61,6 +62,10 @@ def train(argv: Sequence[str]) -> None:
                 ],
                 (),
             ),
+            "faults": (
+                Annotated[Faults, tyro.conf.OmitArgPrefixes, tyro.conf.arg(help="Missing and faulty sensors.")],
+                Faults(),
+            ),
             "training": (
                 Annotated[Options, tyro.conf.arg(name="", help="Length and evaluations.")],
                 Options(),
@@ -79,7 +84,8 @@ def train(argv: Sequence[str]) -> None:
         },
     )
     options = parse(options_type, rest, f"beliefrl train {name}")
-    task = tasks.make(options.task, options.observe or None, **named_values(options.constants, "--constants"))
+    constants = named_values(options.constants, "--constants")
+    task = tasks.make(options.task, options.observe or None, options.faults, **constants)
     run_training(
         options.agent,
         task,

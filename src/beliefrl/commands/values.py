@@ -57,6 +57,25 @@ def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
 
 
 @VALUES.primitive_rule
+def _one_or_several(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """Parse one number as float, and several as tuple[float, ...]."""
+    if info.type != float | tuple[float, ...]:
+        return None
+
+    def parsed(given: list[str]) -> float | tuple[float, ...]:
+        values = tuple(map(float, given))
+        return values[0] if len(values) == 1 else values
+
+    return PrimitiveConstructorSpec(
+        nargs="*",
+        metavar="FLOAT [FLOAT ...]",
+        instance_from_str=parsed,
+        is_instance=lambda value: isinstance(value, float | tuple),
+        str_from_instance=lambda value: list(map(str, value if isinstance(value, tuple) else [value])),
+    )
+
+
+@VALUES.primitive_rule
 def _several(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
     """Show the empty default of tuple[T, ...] as "none"."""
     if info.type_origin is not tuple or get_args(info.type)[1:] != (...,):

@@ -38,6 +38,8 @@ def is_complete(config: Any) -> bool:
     if not ({"seed", "seeds"} <= config["options"].keys() and isinstance(config.get("observe"), list | None)):
         return False
     resumed = config.get("resumed", [])
+    if not isinstance(config.get("faults", {}), dict):
+        return False
     return isinstance(resumed, list) and all(map(_is_session, [config, *resumed]))
 
 

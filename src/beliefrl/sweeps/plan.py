@@ -20,10 +20,12 @@ from typing import Any
 from beliefrl import agents, tasks
 from beliefrl.runs.options import Options
 from beliefrl.runs.run import Run
+from beliefrl.tasks.faults import Faults
 from beliefrl.training.schedule import capacity
 from beliefrl.types import UserError
 
 OPTIONS = tuple(field.name for field in dataclasses.fields(Options))
+FAULTS = tuple(field.name for field in dataclasses.fields(Faults))
 SHRINKS = ("step_start_rl", "train_times_fivrm", "pretrain_updates")  # hyperparameters that count steps or updates
 LONGEST_NAME = 120  # characters of a folder's name, without the seeds
 
@@ -37,7 +39,8 @@ class Experiment:
     task: str
     """The task's name, such as pendulum-v or gym:MountainCarContinuous-v0."""
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Hyperparameters of the agent, and training options (`beliefrl.Options`) such as steps."""
+    """Hyperparameters of the agent, training options (`beliefrl.Options`) such as steps, and faults of the sensors
+    (`beliefrl.Faults`) such as noise."""
     seeds: Sequence[int] = (0, 1, 2, 3, 4)
     """The seed numbers; the paper uses 5 seeds (Appendix B)."""
     observe: Sequence[int | str] = ()
@@ -57,6 +60,7 @@ class Training:
     options: dict[str, Any]  # training options; seed, seeds and steps are always present
     observe: tuple[int | str, ...] = ()
     constants: dict[str, Any] = dataclasses.field(default_factory=dict)
+    faults: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     @property
     def steps(self) -> int:
@@ -68,7 +72,7 @@ class Training:
 
     def command(self, sweep: pathlib.Path) -> list[str]:
         """The arguments of `beliefrl` that start this training, or continue it."""
-        given = [*self.settings.items(), *self.options.items()]
+        given = [*self.settings.items(), *self.options.items(), *self.faults.items()]
         flags = [part for name, value in given for part in _flag(name, value)]
         seen = ["--observe", *map(str, self.observe)] if self.observe else []
         made = ["--constants", *(f"{name}={json.dumps(value)}" for name, value in self.constants.items())]
@@ -98,7 +102,7 @@ def grid(
 
     Args:
         agents, tasks: names.
-        settings: the values to try, for each hyperparameter or training option.
+        settings: the values to try, for each hyperparameter, training option or fault of the sensors.
         seeds: the number of seeds, counted from 0, or a list of seed numbers.
         fixed: settings with one value.
     """
@@ -114,7 +118,7 @@ def grid(
 
 def shrunk(experiment: Experiment, scale: float) -> Experiment:
     """A copy with all step counts scaled: training, exploration, pre-training, and the interval of evaluations."""
-    hyperparameters, options = _split(experiment.settings)
+    hyperparameters, options, _ = _split(experiment.settings)
     agent: Any = _agent(experiment.agent, hyperparameters)
     counts = {name: value for name, value in dataclasses.asdict(agent).items() if name in SHRINKS}
     counts |= {name: options.get(name, getattr(Options, name)) for name in ("steps", "eval_every")}
@@ -169,7 +173,7 @@ def extended(
 
 def _line(training: Training) -> tuple[Any, ...]:
     """A key that is equal for trainings that differ only in seeds and options."""
-    settings = json.dumps([training.settings, training.constants], sort_keys=True, default=str)
+    settings = json.dumps([training.settings, training.constants, training.faults], sort_keys=True, default=str)
     return training.agent, training.task, settings, training.observe
 
 
@@ -193,8 +197,9 @@ def _seed_ranges(experiment: Experiment, seeds_per_run: int | None) -> list[tupl
 
 
 def _training(experiment: Experiment, first: int, count: int) -> Training:
-    settings, options = _split(experiment.settings)
-    changed = [f"{name}={_as_text(value)}" for name, value in {**settings, **dict(experiment.constants)}.items()]
+    settings, options, faults = _split(experiment.settings)
+    named = [*settings.items(), *experiment.constants.items(), *faults.items()]
+    changed = [f"{name}={_as_text(value)}" for name, value in named]
     seen = [f"observe={_as_text(experiment.observe)}"] if experiment.observe else []
     seeds = f"seed{first}" + (f"to{first + count - 1}" if count > 1 else "")
     name = re.sub(r"[^\w.=,-]+", "-", "-".join([experiment.agent, experiment.task, *changed, *seen]))
@@ -209,6 +214,7 @@ def _training(experiment: Experiment, first: int, count: int) -> Training:
         options,
         tuple(experiment.observe),
         dict(experiment.constants),
+        faults,
     )
 
 
@@ -216,13 +222,14 @@ def _as_text(value: Any) -> str:
     return ",".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
 
 
-def _split(settings: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The hyperparameters and the training options among `settings`."""
+def _split(settings: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+    """The hyperparameters, the training options and the faults among `settings`."""
     for name in ("seed", "seeds"):
         if name in settings:
             raise UserError(f"{name} cannot be a setting of a sweep: use the argument or option for seeds.")
     options = {name: value for name, value in settings.items() if name in OPTIONS}
-    return {name: value for name, value in settings.items() if name not in OPTIONS}, options
+    faults = {name: value for name, value in settings.items() if name in FAULTS}
+    return {name: value for name, value in settings.items() if name not in options | faults}, options, faults
 
 
 def _check(trainings: Iterable[Training]) -> None:
@@ -231,9 +238,10 @@ def _check(trainings: Iterable[Training]) -> None:
     for training in trainings:
         agent = _agent(training.agent, training.settings)
         capacity(agent, Options(**_typed(training.options, Options)))
-        key = json.dumps([training.task, training.observe, training.constants], sort_keys=True, default=str)
+        task = [training.task, training.observe or None, training.faults, training.constants]
+        key = json.dumps(task, sort_keys=True, default=str)
         if key not in specs:
-            specs[key] = tasks.make(training.task, training.observe or None, **training.constants).spec
+            specs[key] = tasks.make(*task[:3], **training.constants).spec
 
 
 def _agent(name: str, hyperparameters: dict[str, Any]) -> Any:

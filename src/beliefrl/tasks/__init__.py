@@ -2,7 +2,7 @@
 
 import dataclasses
 import difflib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from beliefrl.catalogue import our_task_names as our_names
 from beliefrl.catalogue import task_names as names
 from beliefrl.imports import declared, declared_name, load, load_declared, path
 from beliefrl.tasks import registered
+from beliefrl.tasks.faults import NONE, Faults, faults_of, with_faults, without_faults
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.types import Spec, UserError, check_indices, said, tuples
 
@@ -81,8 +82,10 @@ def observe(task: Any, indices: tuple[int, ...]) -> Any:
     """The same task with only the entries `indices` of its observation.
 
     Raises:
-        UserError: an index is outside the observation or occurs twice, or there is no index.
+        UserError: an index is outside the observation or occurs twice, there is no index, or the task has faults.
     """
+    if faults_of(task) != NONE:
+        raise UserError("The task has faults already: select the entries first, then add the faults (with_faults).")
     size = task.spec.obs_dim
     check_indices(indices, size)
     if isinstance(task, GymnasiumTask):
@@ -92,12 +95,25 @@ def observe(task: Any, indices: tuple[int, ...]) -> Any:
 
 
 def entries(task: Any) -> tuple[int, ...]:
-    """Indices of the entries that the agent sees in the task's full observation, in the agent's order."""
+    """Indices of the entries that the agent sees in the task's full observation, in the agent's order.
+
+    The flag of `Faults.flicker_flag` has the index after the last one of the full observation.
+    """
+    if faults_of(task) != NONE:
+        inner = without_faults(task)
+        return (*entries(inner), _full(inner).spec.obs_dim) if faults_of(task).flicker_flag else entries(inner)
     if isinstance(task, Observed):
         inner = entries(task.task)
         return tuple(inner[i] for i in task.indices)
     indices = getattr(task, "indices", None)
     return tuple(range(task.spec.obs_dim)) if indices is None else tuple(indices)
+
+
+def _full(task: Any) -> Any:
+    """The same task with its full observation."""
+    if isinstance(task, Observed):
+        return _full(task.task)
+    return dataclasses.replace(task, indices=None) if isinstance(task, GymnasiumTask) else task
 
 
 def entry_names(task: Any) -> tuple[str, ...]:
@@ -106,6 +122,9 @@ def entry_names(task: Any) -> tuple[str, ...]:
     Raises:
         UserError: the number of names differs from the number of entries.
     """
+    if faults_of(task) != NONE:
+        inner = entry_names(without_faults(task))
+        return (*inner, "lost") if faults_of(task).flicker_flag else inner
     if isinstance(task, Observed):
         inner = entry_names(task.task)
         return tuple(inner[i] for i in task.indices)
@@ -152,7 +171,13 @@ def masks(task: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
     return tuple(getattr(task, "VELOCITIES", ())), tuple(getattr(task, "POSITIONS", ()))
 
 
-def make(name: str, /, observe: Sequence[int | str] | int | str | None = None, **constants: Any) -> Any:
+def make(
+    name: str,
+    /,
+    observe: Sequence[int | str] | int | str | None = None,
+    faults: Faults | Mapping[str, Any] | None = None,
+    **constants: Any,
+) -> Any:
     """Make the task with a name.
 
     "pendulum-v" is the pendulum with velocities only, "pendulum-p" (positions) the one without velocities. "gym:ID" is
@@ -162,13 +187,17 @@ def make(name: str, /, observe: Sequence[int | str] | int | str | None = None, *
         name: name of the task.
         observe: indices of the entries that the agent sees, in that order. "velocities" or "positions" if the task
             defines them. None: all entries.
+        faults: missing and faulty sensors, which apply to the entries that the agent sees; also as a dictionary such as
+            {"noise": 0.1}. None: no faults.
         constants: physical constants of the task to change, or arguments of gymnasium.make.
 
     Raises:
-        UserError: there is no such task or constant, a value is impossible, or `observe` does not fit the task.
+        UserError: there is no such task, constant or fault, a value is impossible, or `observe` or the noise does not
+            fit the task.
     """
     task = _make(name, constants)
-    return task if observe is None else _observed(task, _indices(name, task, observe))
+    task = task if observe is None else _observed(task, _indices(name, task, observe))
+    return with_faults(task, Faults.of(faults))
 
 
 def _make(name: str, constants: dict[str, Any]) -> Any:
@@ -242,9 +271,12 @@ def _indices(name: str, task: Any, observe: Sequence[int | str] | int | str) -> 
 def describe(task: Any) -> dict[str, Any]:
     """{"task": name, "constants": constants, "observe": indices}, the arguments of `make` for a task.
 
-    "observe" is None if the name implies the indices. A task that `make` cannot make has the name module:Class and no
-    constants. Nothing is imported.
+    "observe" is None if the name implies the indices. "faults" with their settings is added if the task has any. A task
+    that `make` cannot make has the name module:Class and no constants. Nothing is imported.
     """
+    faults = faults_of(task)
+    if faults != NONE:
+        return describe(without_faults(task)) | {"faults": faults.settings()}
     if isinstance(task, GymnasiumTask):
         return _describe_gymnasium(task)
     base, indices = (task.task, task.indices) if isinstance(task, Observed) else (task, None)

@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Key, UInt8
 from beliefrl import tasks
 from beliefrl.tasks import Observed, Task
 from beliefrl.tasks.drawing import Picture, Viewer, paint
+from beliefrl.tasks.faults import Faulty
 from beliefrl.types import LARGEST, UserError
 
 # The task is a static argument, so environments of equal tasks share one compiled program.
@@ -87,7 +88,7 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (spec.action_dim,), np.float32)
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (spec.obs_dim,), np.float32)
         # Pictures also show what is hidden from the agent.
-        self._drawn: Any = self.task
+        self._drawn: Any = tasks.without_faults(self.task)
         while isinstance(self._drawn, Observed):
             self._drawn = self._drawn.task
         if hasattr(self._drawn, "dt"):
@@ -97,14 +98,14 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
 
     @property
     def states(self) -> list[Any]:
-        """The task's states in this episode, the newest last. Without a render mode there is only the newest.
+        """The task's true states in this episode, the newest last. Without a render mode there is only the newest.
 
         Raises:
             UserError: `reset` has not been called.
         """
         if not self._states:
             raise UserError("The environment has no state yet: call reset first.")
-        return self._states
+        return [state.task for state in self._states] if isinstance(self.task, Faulty) else self._states
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -128,9 +129,9 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         action = np.asarray(action, np.float32)
         if action.shape != self.action_space.shape:
             raise UserError(f"The action has the shape {action.shape}: it must be {self.action_space.shape}.")
-        before = self.states
-        self._key, state, *outcome = _step(self.task, self._key, before[-1], action)
-        self._states = [*before, state] if self.render_mode else [state]
+        _ = self.states  # raises an error before the first reset
+        self._key, state, *outcome = _step(self.task, self._key, self._states[-1], action)
+        self._states = [*self._states, state] if self.render_mode else [state]
         self._show()
         obs, reward, terminated, success = jax.device_get(outcome)
         info = {"is_success": bool(success)} if self.task.spec.has_success else {}

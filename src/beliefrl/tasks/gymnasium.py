@@ -13,6 +13,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from beliefrl.tasks.faults import NONE, STREAM, Draws, Faults
 from beliefrl.tasks.spaces import check_actions, flat_bounds, flat_size, limits
 from beliefrl.types import LARGEST, Spec, UserError, check_indices, check_range, said, short
 
@@ -43,6 +44,8 @@ class GymnasiumTask:
     """Time limit in steps, which truncates episodes; None: the environment's own limit."""
     has_success: bool = False
     """Whether the environment's info has `is_success` or `success`; the success rate is then logged."""
+    faults: Faults = NONE
+    """Missing and faulty sensors."""
 
     def __post_init__(self) -> None:
         """Set the default name. Raise a UserError for an impossible time limit."""
@@ -61,15 +64,17 @@ class GymnasiumTask:
         environment = self.environment()
         environment.close()
         actions = environment.inner_action_space
-        return Spec(environment.indices.size, actions.low.size, environment.limit or LARGEST, self.has_success)
+        size = self.faults.observed_size(environment.indices.size)
+        return Spec(size, actions.low.size, environment.limit or LARGEST, self.has_success)
 
     def environment(self, seed: str = "") -> "Environment":
         """Make one environment, as the agent sees it. `seed` identifies it in the messages of faults.
 
         Raises:
-            UserError: the environment cannot be made, or its spaces are not supported.
+            UserError: the environment cannot be made, its spaces are not supported, or the noise does not fit its
+                observation.
         """
-        return Environment(self, seed)
+        return Environment(self, seed) if self.faults == NONE else FaultyEnvironment(self, seed)
 
 
 class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -208,6 +213,44 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         if not isinstance(value, bool | np.bool_ | int | np.integer) or value not in (0, 1):
             raise self._fault(f"{name} is {short(value)}, but must be True or False")
         return bool(value)
+
+
+class FaultyEnvironment(Environment):
+    """The same with the faults of its task. Their random numbers come from the seed that `reset` gets."""
+
+    def __init__(self, task: GymnasiumTask, seed: str = ""):
+        """Make the environment, and check that the noise fits its observation."""
+        super().__init__(task, seed)
+        self._faults, self._random = task.faults, np.random.default_rng()
+        size = task.faults.observed_size(self.indices.size)
+        self.observation_space = spaces.Box(-np.inf, np.inf, (size,), np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start an episode."""
+        obs, info = super().reset(seed=seed, options=options)
+        if seed is not None:
+            self._random = np.random.default_rng((seed, STREAM))
+        self._waiting = self._faults.start(np, obs)
+        self._action = np.zeros(self.inner_action_space.low.size, np.float32)
+        return self._observed(obs, self._draws()), info
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Apply an action in [-1, 1], or the previous one again."""
+        draws = self._draws()
+        self._action = self._faults.applied(np, action, self._action, draws)
+        obs, reward, terminated, truncated, info = super().step(self._action)
+        return self._observed(obs, draws), reward, terminated, truncated, info
+
+    def _observed(self, obs: np.ndarray, draws: Draws) -> np.ndarray:
+        self._waiting, seen = self._faults.observe(np, self._waiting, obs, draws)
+        return seen
+
+    def _draws(self) -> Draws:
+        size = self.indices.size
+        normal, uniform = self._random.standard_normal, self._random.random
+        return Draws(normal(size, np.float32), uniform(size, np.float32), uniform(), uniform())
 
 
 def success_of(info: Any) -> bool:

@@ -125,7 +125,7 @@ def task_of(run: Run | str | os.PathLike[str]) -> Any:
     if not tasks.knows(name):
         raise UserError(f"{run.folder} was trained on {name}, which is not a task of this library: pass task=.")
     with _naming(run):
-        return tasks.make(name, **constants | {"observe": run.config.get("observe")})
+        return tasks.make(name, **constants | {each: run.config.get(each) for each in ("observe", "faults")})
 
 
 @contextlib.contextmanager

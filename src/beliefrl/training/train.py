@@ -155,10 +155,11 @@ def _reporting(run: Run, report: Report | None, progress: bool) -> Iterator[Repo
 
 def _check_same(run: Run, config: dict[str, Any]) -> None:
     """Raise a UserError where a run was trained with other settings than `config` has; steps may differ."""
-    asked = {name: config[name] for name in ("agent", "task", "constants", "observe")}
+    asked = {name: config.get(name) for name in ("agent", "task", "constants", "observe", "faults")}
     asked = asked | config["options"] | config["hyperparameters"]
     asked = json.loads(json.dumps(asked, default=str))  # tuples are lists in the run's config
-    there = {**run.config, **run.config["options"], **run.config["hyperparameters"], "steps": asked["steps"]}
+    there = {"faults": None} | run.config | run.config["options"] | run.config["hyperparameters"]
+    there["steps"] = asked["steps"]
     for name, value in asked.items():
         if there.get(name, value) != value:
             change = "choose another --out, in Python out="

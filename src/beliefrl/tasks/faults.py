@@ -1,0 +1,221 @@
+"""Missing and faulty sensors on any task: noise, lost observations, lost entries, delay, and actions that repeat.
+
+At each step, in this order:
+
+    the action that is applied   the agent's action, or the one that was applied before (`sticky`)
+    the task's observation       that of `delay` steps ago, plus Gaussian noise, then zeros for what is lost
+
+The equations are in `Faults`, for JAX and for numpy. `Faulty` applies them to JAX tasks, and
+`gymnasium.FaultyEnvironment` to Gymnasium environments.
+"""
+
+import dataclasses
+import numbers
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Key
+
+from beliefrl.types import LARGEST, Spec, UserError, check_choice, check_range, tuples
+
+LONGEST_DELAY = 10_000
+STREAM = 1_179_406_420  # separates the random numbers of faults from those of the task, which has the same key
+
+
+class Draws(NamedTuple):
+    """The random numbers of one step, arrays of JAX or of numpy."""
+
+    noise: Any  # (obs,), standard normal
+    entries: Any  # (obs,), uniform in [0, 1), as are the others
+    whole: Any  # ()
+    action: Any  # ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Faults:
+    """Missing and faulty sensors. By default there are none.
+
+    The agent perceives the true reward, without delay, and the action that it chose.
+    """
+
+    noise: float | tuple[float, ...] = 0.0
+    """Standard deviation of Gaussian noise that is added to the observation: one number for all entries, or one for
+    each entry."""
+    flicker: float = 0.0
+    """Probability, at each step, that the whole observation is lost. The agent then observes zeros."""
+    flicker_flag: bool = False
+    """Append an entry to the observation, which is 1 where the whole observation is lost and 0 elsewhere."""
+    dropout: float = 0.0
+    """Probability, at each step, that an entry of the observation is lost. The agent then observes a zero there."""
+    delay: int = 0
+    """Number of steps by which the observation is late. At the start of an episode the first one repeats."""
+    sticky: float = 0.0
+    """Probability, at each step, that the previous action is applied again in place of the new one. Before the first
+    action it is zero, the middle of its range."""
+
+    def __post_init__(self) -> None:
+        """Raise a UserError for impossible values."""
+        given: Any = self.noise
+        several = isinstance(given, list | tuple) or getattr(given, "ndim", 0) == 1
+        deviations: tuple[Any, ...] = tuple(given) if several else (given,)
+        if not deviations or not all(map(_is_deviation, deviations)):
+            shown = " ".join(map(str, deviations)) or "()"
+            raise UserError(
+                f"noise={shown} is impossible: it must be a number of at least 0, or one for each entry of the "
+                "observation."
+            )
+        deviations = tuple(map(float, deviations))
+        noise = 0.0 if not any(deviations) else deviations if several else deviations[0]
+        object.__setattr__(self, "noise", noise)
+        check_range(self, ("flicker", "dropout", "sticky"), 0, 1)
+        check_range(self, ("delay",), 0, LONGEST_DELAY)
+        check_choice(self, "flicker_flag", (False, True))
+
+    @classmethod
+    def of(cls, settings: "Faults | Mapping[str, Any] | None") -> "Faults":
+        """Faults from their `settings`; None: no faults.
+
+        Raises:
+            UserError: there is no such fault, or a value is impossible.
+        """
+        if isinstance(settings, Faults):
+            return settings
+        known = [field.name for field in dataclasses.fields(cls)]
+        for name in settings or {}:
+            if name not in known:
+                raise UserError(f"There is no fault {name!r}: there is {', '.join(known)}.")
+        return cls(**tuples(settings or {}))
+
+    def settings(self) -> dict[str, Any]:
+        """The fields that differ from their defaults, as runs record them."""
+        return {
+            field.name: getattr(self, field.name)
+            for field in dataclasses.fields(self)
+            if getattr(self, field.name) != field.default
+        }
+
+    def observed_size(self, size: int) -> int:
+        """The number of entries that the agent observes of a task whose observation has `size` entries.
+
+        Raises:
+            UserError: `noise` has another number of deviations.
+        """
+        if isinstance(self.noise, tuple) and len(self.noise) != size:
+            entries = "1 entry" if size == 1 else f"{size} entries"
+            raise UserError(
+                f"noise={' '.join(map(str, self.noise))} has {len(self.noise)} deviations, but the observation has "
+                f"{entries}: give one number for all, or one for each entry."
+            )
+        return size + self.flicker_flag
+
+    def applied(self, xp: Any, action: Any, before: Any, draws: Draws) -> Any:
+        """The action (action,) that is applied: `action`, or the one that was applied `before`. `xp`: numpy or jnp."""
+        return xp.where(draws.action < self.sticky, before, action)
+
+    def start(self, xp: Any, obs: Any) -> Any:
+        """The measurements (delay, obs) on their way to the agent at the start of an episode, the oldest first."""
+        return xp.repeat(obs[None], self.delay, axis=0)
+
+    def observe(self, xp: Any, waiting: Any, obs: Any, draws: Draws) -> tuple[Any, Any]:
+        """The measurements that still wait after this step, and the observation of the agent.
+
+        `waiting` (delay, obs) are those before this step, and `obs` (obs,) is the true observation.
+        """
+        waiting = xp.concatenate([waiting, obs[None]])
+        seen = waiting[0] + xp.asarray(self.noise, obs.dtype) * draws.noise
+        lost = draws.whole < self.flicker
+        seen = xp.where(lost | (draws.entries < self.dropout), xp.zeros_like(seen), seen)
+        if self.flicker_flag:
+            seen = xp.concatenate([seen, xp.asarray(lost, obs.dtype)[None]])
+        return waiting[1:], seen
+
+
+def _is_deviation(value: Any) -> bool:
+    return isinstance(value, numbers.Real) and not isinstance(value, bool) and 0 <= float(value) <= LARGEST
+
+
+NONE = Faults()
+
+
+class FaultyState(NamedTuple):
+    """The state of a task, and of its faults."""
+
+    task: Any
+    waiting: Float[Array, "delay obs"]
+    action: Float[Array, " action"]  # that was applied last
+
+
+@dataclasses.dataclass(frozen=True)
+class Faulty:
+    """A JAX task with faults. Its true states and rewards are those of the task."""
+
+    task: Any
+    faults: Faults
+
+    def __post_init__(self) -> None:
+        """Raise a UserError if the noise does not fit the observation."""
+        self.faults.observed_size(self.task.spec.obs_dim)
+
+    @property
+    def spec(self) -> Spec:
+        spec = self.task.spec
+        return spec._replace(obs_dim=self.faults.observed_size(spec.obs_dim))
+
+    def reset(self, key: Key[Array, ""]) -> tuple[FaultyState, Float[Array, " obs"]]:
+        state, obs = self.task.reset(key)
+        waiting, seen = self.faults.observe(jnp, self.faults.start(jnp, obs), obs, self._draws(key))
+        return FaultyState(state, waiting, jnp.zeros(self.task.spec.action_dim)), seen
+
+    def step(
+        self, state: FaultyState, action: Float[Array, " action"], key: Key[Array, ""]
+    ) -> tuple[FaultyState, Float[Array, " obs"], Float[Array, ""], Bool[Array, ""]]:
+        draws = self._draws(key)
+        action = self.faults.applied(jnp, action, state.action, draws)
+        inner, obs, reward, terminated = self.task.step(state.task, action, key)
+        waiting, seen = self.faults.observe(jnp, state.waiting, obs, draws)
+        return FaultyState(inner, waiting, action), seen, reward, terminated
+
+    def success(self, state: FaultyState) -> Bool[Array, ""]:
+        return self.task.success(state.task)
+
+    def _draws(self, key: Key[Array, ""]) -> Draws:
+        size = (self.task.spec.obs_dim,)
+        noise, entries, whole, action = jax.random.split(jax.random.fold_in(key, STREAM), 4)
+        return Draws(
+            jax.random.normal(noise, size),
+            jax.random.uniform(entries, size),
+            jax.random.uniform(whole),
+            jax.random.uniform(action),
+        )
+
+
+def with_faults(task: Any, faults: Faults) -> Any:
+    """The same task with missing and faulty sensors; without any faults, the task itself.
+
+    Raises:
+        UserError: the task has faults already, or the noise does not fit its observation.
+    """
+    if faults == NONE:
+        return task
+    if faults_of(task) != NONE:
+        raise UserError("The task has faults already: give all faults at once.")
+    return Faulty(task, faults) if _is_bare(task) else dataclasses.replace(task, faults=faults)
+
+
+def faults_of(task: Any) -> Faults:
+    """The faults of a task, by default none."""
+    return NONE if _is_bare(task) else task.faults
+
+
+def without_faults(task: Any) -> Any:
+    """The same task without its faults."""
+    if isinstance(task, Faulty):
+        return task.task
+    return task if _is_bare(task) else dataclasses.replace(task, faults=NONE)
+
+
+def _is_bare(task: Any) -> bool:
+    """Whether a task has no field for faults: it is neither a Faulty nor a GymnasiumTask."""
+    return not isinstance(getattr(task, "faults", None), Faults)
