@@ -7,8 +7,8 @@ import optax
 import pytest
 
 from beliefrl.models import double_q
-from beliefrl.models.double_q import Optimisers, Unit
-from beliefrl.models.soft_actor_critic import Batch
+from beliefrl.models.double_q import Unit, init_optimisers
+from beliefrl.models.soft_actor_critic import Batch, Optimisers
 
 BELIEF, ACTION, COUNT = 5, 2, 12
 KEY = jax.random.key(0)
@@ -102,7 +102,7 @@ def test_what_is_learned_does_not_depend_on_the_size_of_rewards(size):
 
     @jax.jit
     def learn(controller, data):
-        state = optimisers.init(controller)
+        state = init_optimisers(optimisers, controller)
         for number in range(5):
             key = jax.random.key(number)
             controller, state, _ = double_q.update(optimisers, state, controller, data, key, 0.1, 1e-3)
@@ -124,7 +124,9 @@ def test_an_update_moves_the_targets_by_tau_and_ignores_what_is_not_valid():
 
     @jax.jit
     def update(data):
-        return double_q.update(optimisers, optimisers.init(controller), controller, data, KEY, 0.25, 1e-3)[0]
+        return double_q.update(optimisers, init_optimisers(optimisers, controller), controller, data, KEY, 0.25, 1e-3)[
+            0
+        ]
 
     after, same = update(data), update(other)
     for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(same), strict=True):

@@ -27,8 +27,8 @@ Metrics = dict[str, Float[Array, ""]]
 
 
 @dataclasses.dataclass(frozen=True)
-class SACAgent:
-    """Base class of agents whose controller is a soft actor-critic on beliefs (Table 1)."""
+class ControllerAgent:
+    """Base class of agents whose controller is a soft actor-critic: its hyperparameters, its actions, its batches."""
 
     gamma: float = 0.99
     """Discount factor γ, in [0, 1] (Table 1)."""
@@ -36,12 +36,8 @@ class SACAgent:
     """Environment steps before training starts; the untrained policy acts until then (Table 1)."""
     train_interval_rl: int = 1
     """Environment steps between two updates of the controller (Table 1)."""
-    updates_per_step: int = 1
-    """Updates of the controller at each of these steps (Table 1: one). More need fewer steps and more time a step."""
     n_step: int = 1
     """Steps of the critics' n-step returns (the paper: one). More propagate rewards faster over a long horizon."""
-    value_start: float = 0.0
-    """Initial output of V and Q, up to noise from the initial weights (the paper: 0), in units of the return."""
     lr_actor: float = 3e-4
     """Adam's learning rate for the actor (Table 1)."""
     lr_critic: float = 3e-4
@@ -61,10 +57,9 @@ class SACAgent:
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
-        check_range(self, ("train_interval_rl", "updates_per_step"), 1)
+        check_range(self, ("train_interval_rl",), 1)
         check_range(self, ("policy_layers", "value_layers"), 1, WIDEST)
         check_range(self, ("n_step",), 1, MOST_STEPS)
-        check_range(self, ("value_start",), -LARGEST)
         check_range(self, ("actor_regulariser",), 0)
         check_range(self, ("step_start_rl",), 2)  # fewer timesteps hold no transition
         check_range(self, ("lr_actor", "lr_critic", "lr_alpha", "gamma", "tau"), 0, 1)
@@ -73,11 +68,6 @@ class SACAgent:
         for field in dataclasses.fields(self):
             if field.type is bool:
                 check_choice(self, field.name, (True, False))
-
-    @property
-    def cycle_updates(self) -> int:
-        """Updates of the controller in a cycle."""
-        return self.cycle // self.train_interval_rl * self.updates_per_step
 
     @property
     def cycle(self) -> int:
@@ -90,40 +80,20 @@ class SACAgent:
         raise NotImplementedError
 
     @property
-    def losses(self) -> tuple[str, ...]:
-        """The metrics that end a seed where they are not finite."""
-        return "loss_value", "loss_q", "loss_actor"
-
-    @property
     def optimisers(self) -> Optimisers:
         return Optimisers(optax.adam(self.lr_actor), optax.adam(self.lr_critic), optax.adam(self.lr_alpha))
 
-    def init_controller(
-        self, key: Key[Array, ""], belief: int, action: int, actor_size: int | None = None
-    ) -> tuple[Controller, OptimiserState]:
-        """A new controller and its optimisers; `actor_size` is the actor's input size where that is not the belief."""
-        sizes = belief, action, self.policy_layers, self.value_layers
-        controller = init_controller(*sizes, key, actor_size, self.value_start)
-        return controller, init_optimisers(self.optimisers, controller)
-
     def choose(
         self,
-        controller: Controller,
+        controller: Any,
         actor_input: Float[Array, " actor_input"],
         key: Key[Array, ""],
         explore: Bool[Array, ""],
     ) -> Float[Array, " action"]:
-        """An action: a sample of the policy, or its mode where not `explore`."""
+        """An action: a sample of the policy, or its mode if not `explore`."""
         mean, log_sigma = controller.actor(actor_input)
         noise = jnp.where(explore, jax.random.normal(key, mean.shape), 0.0)
         return tanh_gaussian(mean, log_sigma, noise)[0]
-
-    def controller_loss(
-        self, controller: Controller, batch: Batch, key: Key[Array, ""]
-    ) -> tuple[Float[Array, ""], Metrics]:
-        """The four losses of soft actor-critic, summed; and what to log."""
-        noise = jax.random.normal(key, batch.action.shape)
-        return loss(controller, batch, noise, self.actor_regulariser, self.target_entropy)
 
     def transitions(
         self,
@@ -144,6 +114,48 @@ class SACAgent:
         after = belief if next_belief is None else next_belief
         step, valid = windows.between(burn_in, None).step, transitions(windows, burn_in)
         return transition_batch(step, valid, belief, after, self.n_step, self.gamma, actor_input)
+
+
+@dataclasses.dataclass(frozen=True)
+class SACAgent(ControllerAgent):
+    """Base class of the paper's agents, whose controller has a V (Table 1)."""
+
+    updates_per_step: int = 1
+    """Updates of the controller every `train_interval_rl` steps (Table 1: one). With more, learning takes fewer steps,
+    and each step takes longer."""
+    value_start: float = 0.0
+    """Initial output of V and Q, up to noise from the initial weights (the paper: 0), in units of the return."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible values with a UserError."""
+        super().__post_init__()
+        check_range(self, ("updates_per_step",), 1)
+        check_range(self, ("value_start",), -LARGEST)
+
+    @property
+    def cycle_updates(self) -> int:
+        """Updates of the controller in a cycle."""
+        return self.cycle // self.train_interval_rl * self.updates_per_step
+
+    @property
+    def losses(self) -> tuple[str, ...]:
+        """The metrics that end a seed if they are not finite."""
+        return "loss_value", "loss_q", "loss_actor"
+
+    def init_controller(
+        self, key: Key[Array, ""], belief: int, action: int, actor_size: int | None = None
+    ) -> tuple[Controller, OptimiserState]:
+        """A new controller and its optimisers; `actor_size` is the actor's input size where that is not the belief."""
+        sizes = belief, action, self.policy_layers, self.value_layers
+        controller = init_controller(*sizes, key, actor_size, self.value_start)
+        return controller, init_optimisers(self.optimisers, controller)
+
+    def controller_loss(
+        self, controller: Controller, batch: Batch, key: Key[Array, ""]
+    ) -> tuple[Float[Array, ""], Metrics]:
+        """The four losses of soft actor-critic, summed; and what to log."""
+        noise = jax.random.normal(key, batch.action.shape)
+        return loss(controller, batch, noise, self.actor_regulariser, self.target_entropy)
 
     def learn_controller(
         self, controller: Controller, state: OptimiserState, batch: Batch, key: Key[Array, ""]

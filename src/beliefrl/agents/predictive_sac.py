@@ -21,22 +21,20 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from beliefrl.agents.base import MOST_STEPS, Metrics
+from beliefrl.agents.base import ControllerAgent, Metrics
 from beliefrl.models import double_q
-from beliefrl.models.double_q import Controller, Optimisers, OptimiserState
+from beliefrl.models.double_q import Controller
 from beliefrl.models.nets import (
     LSTMState,
     RunningStatistics,
     descend,
     initial_statistics,
     standardise,
-    tanh_gaussian,
     update_statistics,
 )
 from beliefrl.models.predictive_model import PredictiveModel, init_model, prediction_loss
-from beliefrl.models.returns import transition_batch
-from beliefrl.models.soft_actor_critic import Batch
-from beliefrl.types import LARGEST, WIDEST, Spec, Timestep, Window, WindowShape, check_range, transitions
+from beliefrl.models.soft_actor_critic import Batch, OptimiserState
+from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range, transitions
 
 
 class Scales(NamedTuple):
@@ -66,7 +64,7 @@ class State(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class PredictiveSACAgent:
+class PredictiveSACAgent(ControllerAgent):
     """Soft actor-critic on an LSTM that learns only to predict observations and rewards. It is not in the paper."""
 
     # The controller
@@ -74,10 +72,8 @@ class PredictiveSACAgent:
     """Discount factor γ, in [0, 1]."""
     n_step: int = 5
     """Steps of the critics' returns."""
-    step_start_rl: int = 1000
-    """Environment steps before training starts; the untrained policy acts until then."""
     train_interval_rl: int = 1
-    """Environment steps of a cycle: between two updates of the model, and as many of the controller."""
+    """Environment steps between two updates of the model. The controller makes one update for each step."""
     batch_size: int = 256
     """Transitions in an update of the controller."""
     lr_actor: float = 1e-3
@@ -88,8 +84,6 @@ class PredictiveSACAgent:
     """Adam's learning rate for log α, the temperature."""
     alpha_start: float = 0.1
     """α before training, in units of the returns."""
-    target_entropy: float | None = None
-    """Entropy that α aims at; None is minus the number of actions."""
     tau: float = 0.005
     """Fraction by which the target Qs move at each update, in [0, 1]."""
     policy_layers: tuple[int, ...] = (128, 128)
@@ -109,7 +103,7 @@ class PredictiveSACAgent:
     sequences: int = 8
     """Sequences in an update of the model."""
     burn_in: int = 32
-    """Most steps before a sequence that are unrolled from a zero state to begin it."""
+    """Maximum number of steps before a sequence that initialise its state, from zero."""
     d_size: int = 128
     """Size of the LSTM's state h."""
     hidden_size: int = 128
@@ -123,21 +117,14 @@ class PredictiveSACAgent:
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
-        check_range(self, ("train_interval_rl", "batch_size", "seq_len", "sequences", "pool", "longest_memory"), 1)
-        check_range(self, ("policy_layers", "value_layers", "d_size", "hidden_size"), 1, WIDEST)
-        check_range(self, ("n_step",), 1, MOST_STEPS)
-        check_range(self, ("step_start_rl",), 2)  # fewer timesteps hold no transition
-        check_range(self, ("burn_in", "pretrain_updates", "actor_regulariser"), 0)
+        super().__post_init__()
+        check_range(self, ("batch_size", "seq_len", "sequences", "pool", "longest_memory"), 1)
+        check_range(self, ("d_size", "hidden_size"), 1, WIDEST)
+        check_range(self, ("burn_in", "pretrain_updates"), 0)
         check_range(self, ("alpha_start",), 1e-6)
-        check_range(self, ("lr_actor", "lr_critic", "lr_alpha", "lr_model", "gamma", "tau", "long_memories"), 0, 1)
-        if self.target_entropy is not None:
-            check_range(self, ("target_entropy",), -LARGEST)
+        check_range(self, ("lr_model", "long_memories"), 0, 1)
 
     # How it is trained
-
-    @property
-    def cycle(self) -> int:
-        return self.train_interval_rl
 
     @property
     def window(self) -> WindowShape:
@@ -159,10 +146,6 @@ class PredictiveSACAgent:
     def model_optimiser(self) -> optax.GradientTransformation:
         return optax.adam(self.lr_model)
 
-    @property
-    def optimisers(self) -> Optimisers:
-        return Optimisers(optax.adam(self.lr_actor), optax.adam(self.lr_critic), optax.adam(self.lr_alpha))
-
     def init(self, key: Key[Array, ""], spec: Spec) -> State:
         key_model, key_controller = jax.random.split(key)
         sizes = spec.obs_dim, spec.action_dim
@@ -173,7 +156,9 @@ class PredictiveSACAgent:
         scales = Scales(*map(initial_statistics, (spec.obs_dim, 1, belief)))
         model_optimiser = self.model_optimiser.init(model)  # pyright: ignore[reportArgumentType]
         pool = self.empty_pool(belief, spec.action_dim)
-        return State(model, controller, scales, pool, model_optimiser, self.optimisers.init(controller))
+        return State(
+            model, controller, scales, pool, model_optimiser, double_q.init_optimisers(self.optimisers, controller)
+        )
 
     def empty_pool(self, belief: int, action: int) -> Pool:
         def zeros(*shape: int) -> Float[Array, "pool transitions *shape"]:
@@ -203,9 +188,7 @@ class PredictiveSACAgent:
         x = self.perception(state.scales, step)
         memory = state.model.next_state(memory, x, step.is_first)
         belief = standardise(state.scales.belief, jnp.concatenate([memory.d, x]))
-        mean, log_sigma = state.controller.actor(belief)
-        noise = jnp.where(explore, jax.random.normal(key, mean.shape), 0.0)
-        return tanh_gaussian(mean, log_sigma, noise)[0], memory
+        return self.choose(state.controller, belief, key, explore), memory
 
     def note(self, memory: LSTMState) -> tuple[()]:
         return ()
@@ -242,8 +225,7 @@ class PredictiveSACAgent:
     def begin_cycle(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Batch, Metrics]:
         """One update of the model; then a batch from the pool for each update of the controller."""
         state, belief, metrics = self.learn_model(state, windows)
-        step, valid = windows.between(self.burn_in, None).step, transitions(windows, self.burn_in)
-        batch = transition_batch(step, valid, belief, belief, self.n_step, self.gamma)
+        batch = self.transitions(windows, belief)
         pool = add(state.pool, jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), batch))
         batches = draw(pool, key, (self.cycle, self.batch_size))
         scale = state.scales.belief

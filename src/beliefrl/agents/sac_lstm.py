@@ -41,7 +41,7 @@ class SACLSTMAgent(SACAgent):
     batch_size: int = 4
     """Sequences in an update (Appendix A.1.2)."""
     burn_in: int = 64
-    """Most steps before a sequence that are unrolled from a zero state to begin it (Appendix A.1.2)."""
+    """Maximum number of steps before a sequence that initialise its state, from zero (Appendix A.1.2)."""
     d_size: int = 256
     """Size of the LSTM's state (Appendix A.2.2)."""
     lr_lstm: float = 3e-4

@@ -65,7 +65,7 @@ class VRMAgent(SACAgent):
 
     # Appendix A.1
     burn_in: int = 64
-    """Most steps before a sequence that are unrolled from a zero state to begin it (Appendix A.1.2)."""
+    """Maximum number of steps before a sequence that initialise its state, from zero (Appendix A.1.2)."""
     d_size: int = 256
     """Size of the recurrent state d of each model (Appendix A.1.1)."""
     z_size: int = 64

@@ -7,8 +7,8 @@ Source: Haarnoja et al. 2019, Algorithm 1, with s the belief and s' the one m st
     J_π = E α log π(ã|s) - min_i Q_i(s, ã) / u  +  regulariser · ½ E μ²
     J_α = E -log α (log π(ã|s) + H_target)
 
-u is the root mean square of all y so far. The networks of the critics give Q / u, and their last layers are rescaled
-when u changes, so that Q stays the same (van Hasselt et al. 2016, without their mean). So one learning rate and one
+u is a running root mean square of y. The networks of the critics give Q / u, and their last layers are rescaled when u
+changes, so that Q stays the same (van Hasselt et al. 2016, without their mean). So one learning rate and one
 temperature fit tasks with returns of any size. Departure: y holds no entropy. Over a horizon of 200 steps that would be
 more than the rewards of most tasks, and with α in units of u it would be a feedback of u on itself.
 """
@@ -19,7 +19,6 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optax
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.models.nets import MLP, descend, draw, tanh_gaussian
@@ -27,10 +26,14 @@ from beliefrl.models.soft_actor_critic import (
     LOG_SIGMA_MAX,
     LOG_SIGMA_MIN,
     Batch,
+    Optimisers,
+    OptimiserState,
     alpha_loss,
-    q_value,
+    least,
     soft_update,
+    squared_errors,
     valid_mean,
+    wanted_entropy,
 )
 
 UNIT_RATE = 1e-3  # least weight of a new batch in u², reached after 1 / rate batches
@@ -72,24 +75,13 @@ class Controller(NamedTuple):
     unit: Unit
 
 
-class OptimiserState(NamedTuple):
-    actor: optax.OptState
-    critics: optax.OptState
-    alpha: optax.OptState
-
-
-class Optimisers(NamedTuple):
-    actor: optax.GradientTransformation
-    critics: optax.GradientTransformation
-    alpha: optax.GradientTransformation
-
-    def init(self, controller: Controller) -> OptimiserState:
-        """Fresh states for `update`."""
-        return OptimiserState(
-            self.actor.init(controller.actor),  # pyright: ignore[reportArgumentType]
-            self.critics.init(controller.critics),  # pyright: ignore[reportArgumentType]
-            self.alpha.init(controller.log_alpha),
-        )
+def init_optimisers(optimisers: Optimisers, controller: Controller) -> OptimiserState:
+    """Fresh states for `update`."""
+    return OptimiserState(
+        optimisers.actor.init(controller.actor),  # pyright: ignore[reportArgumentType]
+        optimisers.critic.init(controller.critics),  # pyright: ignore[reportArgumentType]
+        optimisers.alpha.init(controller.log_alpha),
+    )
 
 
 def init_controller(
@@ -105,13 +97,6 @@ def init_controller(
     actor, critics = draw(key, (Actor(belief, action, policy_layers), (critic, critic)))
     unit = Unit(jnp.ones(()), jnp.zeros(()))
     return Controller(actor, critics, jax.tree.map(jnp.copy, critics), jnp.full((), math.log(alpha)), unit)
-
-
-def least(
-    critics: tuple[MLP, MLP], belief: Float[Array, "batch belief"], action: Float[Array, "batch action"]
-) -> Float[Array, " batch"]:
-    """min_i Q_i(s, a) / u."""
-    return jnp.minimum(*(q_value(critic, belief, action) for critic in critics))
 
 
 def sample(
@@ -152,8 +137,7 @@ def q_loss(
     critics: tuple[MLP, MLP], batch: Batch, y: Float[Array, " batch"], unit: Float[Array, ""]
 ) -> Float[Array, ""]:
     """J_Q of both critics, summed."""
-    errors = [q_value(critic, batch.belief, batch.action) - y / unit for critic in critics]
-    return valid_mean(0.5 * errors[0] ** 2 + 0.5 * errors[1] ** 2, batch.valid)
+    return squared_errors(critics, batch, y / unit)
 
 
 def actor_loss(
@@ -183,10 +167,10 @@ def update(
     j_q, grad_critics = jax.value_and_grad(q_loss)(controller.critics, batch, y, controller.unit.u)
     differentiate = jax.value_and_grad(actor_loss, has_aux=True)
     (j_pi, (q, log_prob)), grad_actor = differentiate(controller.actor, controller, batch, key_actor, regulariser)
-    entropy = -float(batch.action.shape[-1]) if target_entropy is None else target_entropy
+    entropy = wanted_entropy(batch, target_entropy)
     grad_alpha = jax.grad(alpha_loss)(controller.log_alpha, log_prob, batch.valid, entropy)
     actor, s_actor = descend(optimisers.actor, grad_actor, state.actor, controller.actor)
-    critics, s_critics = descend(optimisers.critics, grad_critics, state.critics, controller.critics)
+    critics, s_critics = descend(optimisers.critic, grad_critics, state.critic, controller.critics)
     log_alpha, s_alpha = descend(optimisers.alpha, grad_alpha, state.alpha, controller.log_alpha)
     metrics = {
         "loss_q": j_q,

@@ -52,6 +52,13 @@ def q_value(
     return jax.vmap(lambda s, a: critic.rest(s + first.weight[:, size:] @ a + first.bias)[0])(projected, action)
 
 
+def least(
+    critics: tuple[MLP, MLP], belief: Float[Array, "batch belief"], action: Float[Array, "batch action"]
+) -> Float[Array, " batch"]:
+    """min_i Q_i(s, a)."""
+    return jnp.minimum(*(q_value(critic, belief, action) for critic in critics))
+
+
 def state_value(value: MLP, belief: Float[Array, "batch belief"]) -> Float[Array, " batch"]:
     """V(s)."""
     return jax.vmap(value)(belief)[:, 0]
@@ -67,8 +74,7 @@ class Controller(NamedTuple):
     log_alpha: Float[Array, ""]
 
     def q(self, belief: Float[Array, "batch belief"], action: Float[Array, "batch action"]) -> Float[Array, " batch"]:
-        """min_i Q_i(s, a)."""
-        return jnp.minimum(*(q_value(critic, belief, action) for critic in self.critics))
+        return least(self.critics, belief, action)
 
 
 class Batch(NamedTuple):
@@ -124,7 +130,11 @@ def value_loss(
 def q_loss(critics: tuple[MLP, MLP], target_value: MLP, batch: Batch) -> Float[Array, ""]:
     """J_Q of both critics, summed."""
     next_value = jnp.where(batch.terminated, 0.0, state_value(target_value, batch.next_belief))
-    target = jax.lax.stop_gradient(batch.reward + batch.discount * next_value)
+    return squared_errors(critics, batch, jax.lax.stop_gradient(batch.reward + batch.discount * next_value))
+
+
+def squared_errors(critics: tuple[MLP, MLP], batch: Batch, target: Float[Array, " batch"]) -> Float[Array, ""]:
+    """E ½ (Q_i(s, a) - target)², summed over both critics."""
     errors = [q_value(critic, batch.belief, batch.action) - target for critic in critics]
     return valid_mean(0.5 * errors[0] ** 2 + 0.5 * errors[1] ** 2, batch.valid)
 
@@ -148,6 +158,11 @@ def alpha_loss(
     return -log_alpha * valid_mean(log_prob + target_entropy, valid)
 
 
+def wanted_entropy(batch: Batch, given: float | None) -> float:
+    """H_target: minus the degrees of freedom of the action, if no other is given."""
+    return -float(batch.action.shape[-1]) if given is None else given
+
+
 def loss(
     controller: Controller,
     batch: Batch,
@@ -167,8 +182,7 @@ def loss(
     alpha = jnp.exp(fixed.log_alpha)
     j_v = value_loss(controller.value, batch.belief, q - alpha * log_prob, batch.valid)
     j_q = q_loss(controller.critics, fixed.target_value, batch)
-    target_entropy = -float(batch.action.shape[-1]) if target_entropy is None else target_entropy
-    j_alpha = alpha_loss(controller.log_alpha, log_prob, batch.valid, target_entropy)
+    j_alpha = alpha_loss(controller.log_alpha, log_prob, batch.valid, wanted_entropy(batch, target_entropy))
     metrics = {
         "loss_value": j_v,
         "loss_q": j_q,
@@ -189,7 +203,7 @@ class Optimisers(NamedTuple):
     """Adam for each group that has a learning rate of its own in Table 1."""
 
     actor: optax.GradientTransformation
-    critic: optax.GradientTransformation  # Q_1, Q_2 and V
+    critic: optax.GradientTransformation  # Q_1, Q_2, and V if there is one
     alpha: optax.GradientTransformation
 
 
