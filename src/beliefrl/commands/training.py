@@ -3,7 +3,7 @@
 import dataclasses
 import pathlib
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -19,6 +19,8 @@ class ResumeOptions:
     """The run's folder."""
     steps: int | None = None
     """Total number of environment steps of each seed, at least as many as before. None: as many as before."""
+    stop_at: float | Literal["same"] | None = "same"
+    """Return at which the training ends, as in `beliefrl train`. None: train for all steps. same: as before."""
     agent: OwnAgent = None
 
 
@@ -62,7 +64,10 @@ def train(argv: Sequence[str]) -> None:
                 (),
             ),
             "training": (
-                Annotated[Options, tyro.conf.arg(name="", help="Length and evaluations.")],
+                Annotated[
+                    Options,
+                    tyro.conf.arg(prefix_name=False, help="How the training runs."),
+                ],
                 Options(),
             ),
             "out": (
@@ -95,4 +100,5 @@ def resume(argv: Sequence[str]) -> None:
     options = parse(ResumeOptions, argv, "beliefrl resume")
     from beliefrl.training.train import resume as go_on
 
-    go_on(options.run, options.steps, agent=own_agent(options.agent), own_process=True)
+    agent = own_agent(options.agent)
+    go_on(options.run, options.steps, agent=agent, own_process=True, stop_at=options.stop_at)
