@@ -30,8 +30,7 @@ def taken(options: Options, agent: Agent, spec: Spec) -> tuple[dict[str, np.ndar
     """
     source = Run(options.init_from or "")
     path = source.agents(options.init_best)
-    saved = arrays.load(path)
-    _check_fit(source, saved, agent, spec)
+    saved = _fitting(source, arrays.load(path), agent, spec)
     first, count = source.seeds[0], len(source.seeds)
     seeds = range(options.seed, options.seed + options.seeds)
     index = [(seed - first) % count for seed in seeds]
@@ -72,13 +71,17 @@ def _last_evaluations(source: Run) -> list[dict[str, Any] | None]:
     return [None if step is None else {"step": step} for step in steps]
 
 
-def _check_fit(source: Run, saved: dict[str, np.ndarray], agent: Agent, spec: Spec) -> None:
-    """Raise a UserError that names the first array in which the saved agent differs from `agent` on a task."""
+def _fitting(source: Run, saved: dict[str, np.ndarray], agent: Agent, spec: Spec) -> dict[str, np.ndarray]:
+    """The networks among the arrays of a saved agent.
+
+    Raises:
+        UserError: they do not fit `agent` on its task; it names the first array that differs.
+    """
     state = jax.eval_shape(lambda key: agent.init(key, spec), jax.random.key(0))
-    wanted = arrays.shapes(agent.networks(state))
-    for name in wanted.keys() - arrays.shapes(state).keys():
+    wanted, known = arrays.shapes(agent.networks(state)), arrays.shapes(state)
+    for name in wanted.keys() - known.keys():
         raise UserError(f"init_from is impossible: networks() of this agent adds {name.lstrip('.')} to its state.")
-    for name in [*wanted, *saved]:
+    for name in [*wanted, *(name for name in saved if name not in known)]:
         there = f"the shape {saved[name].shape[1:]}" if name in saved else "no such array"
         here = f"the shape {wanted[name].shape}" if name in wanted else "no such array"
         if there != here:
@@ -86,3 +89,4 @@ def _check_fit(source: Run, saved: dict[str, np.ndarray], agent: Agent, spec: Sp
                 f"{source.folder} ({source.config['agent']} on {source.config['task']}) cannot be init_from: its "
                 f"{name.lstrip('.')} has {there}, this training's has {here}; the agent and all sizes must be the same."
             )
+    return {name: saved[name] for name in wanted}

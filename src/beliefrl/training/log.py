@@ -56,7 +56,7 @@ def record(recorder: Recorder, event: Event, has_success: bool, lost: Collection
     if event.evaluation is None:
         return None
     if event.states is not None:
-        returns = np.asarray(event.evaluation.episode_return)[:, MODES.index("sampled")].mean(axis=-1)
+        returns = np.asarray(event.evaluation.episode_return)[:, MODES.index("sampled")].mean(axis=-1).tolist()
         best.save(recorder.folder, event.states, event.step, returns)
     return {"step": event.step} | summary(event.evaluation, has_success)
 

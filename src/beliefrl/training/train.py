@@ -182,7 +182,8 @@ def _chosen(options: dict[str, Any]) -> Options:
             raise UserError(f"Training has no option {name!r}: it has {', '.join(known)}.")
     source = options.get("init_from")
     path = source.folder if isinstance(source, Run) else source
-    return Options(**options | {"init_from": str(path) if isinstance(path, os.PathLike) else path})
+    chosen: dict[str, Any] = options | {"init_from": str(path) if isinstance(path, os.PathLike) else path}
+    return Options(**chosen)
 
 
 def _check_possible(options: Options, task: Any, own_process: bool) -> None:
