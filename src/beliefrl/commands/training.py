@@ -21,6 +21,8 @@ class ResumeOptions:
     """Total number of environment steps of each seed, at least as many as before. None: as many as before."""
     stop_at: float | Literal["same"] | None = "same"
     """Return at which the training ends, as in `beliefrl train`. None: train for all steps. same: as before."""
+    step_timeout: float | Literal["same"] | None = "same"
+    """Maximum number of seconds of a step, as in `beliefrl train`. None: no limit. same: as before."""
     agent: OwnAgent = None
 
 
@@ -64,10 +66,7 @@ def train(argv: Sequence[str]) -> None:
                 (),
             ),
             "training": (
-                Annotated[
-                    Options,
-                    tyro.conf.arg(prefix_name=False, help="How the training runs."),
-                ],
+                Annotated[Options, tyro.conf.arg(prefix_name=False, help="How the training runs.")],
                 Options(),
             ),
             "out": (
@@ -100,5 +99,11 @@ def resume(argv: Sequence[str]) -> None:
     options = parse(ResumeOptions, argv, "beliefrl resume")
     from beliefrl.training.train import resume as go_on
 
-    agent = own_agent(options.agent)
-    go_on(options.run, options.steps, agent=agent, own_process=True, stop_at=options.stop_at)
+    go_on(
+        options.run,
+        options.steps,
+        agent=own_agent(options.agent),
+        own_process=True,
+        stop_at=options.stop_at,
+        step_timeout=options.step_timeout,
+    )

@@ -131,7 +131,9 @@ class Run:
         Raises:
             UserError: a log cannot be read.
         """
-        going = [] if line is None else [seed for seed in self.seeds if not any(self.rows(seed, "diverged"))]
+        if line is None:
+            return False
+        going = [seed for seed in self.seeds if not any(self.rows(seed, "diverged"))]
         returns = [[fmean(row["sampled"]) for row in self.rows(seed, "evaluation")][-patience:] for seed in going]
         return bool(going) and all(len(last) == patience and min(last) >= line for last in returns)
 

@@ -114,11 +114,11 @@ def stages(
         program = host_loop.program(agent, task, *sizes, numbers, processes, notify, options.step_timeout)
     else:
         program = phases.compile_program(agent, task, *sizes)
-    keys = jax.vmap(jax.random.key)(np.array(numbers))
+    keys, at = jax.vmap(jax.random.key)(np.array(numbers)), TrainingProgress(refreshed=initial is not None)
     try:
         if restore is None:
             yield Event(Phase.COMPILING_AGENT, 0)
-            at, seeds = TrainingProgress(refreshed=initial is not None), program.begin(keys)
+            seeds = program.begin(keys)
             seeds = seeds if initial is None else seeds._replace(state=initial(seeds.state))
         else:
             at, seeds = restore(program.shapes(keys))

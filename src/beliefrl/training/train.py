@@ -103,6 +103,7 @@ def resume(
     own_process: bool = False,
     progress: bool = True,
     stop_at: float | Literal["same"] | None = "same",
+    step_timeout: float | Literal["same"] | None = "same",
 ) -> Run:
     """Go on with a training from its last checkpoint.
 
@@ -118,14 +119,15 @@ def resume(
         agent: needed only where an agent of your own was trained: its class, or an instance.
         stop_at: the option `stop_at` from now on; None: train for all steps; "same": as before. A training that has
             reached its `stop_at` is finished, and goes on only with a higher one or None.
+        step_timeout: the option `step_timeout` from now on; None: no limit; "same": as before.
 
     Raises:
         UserError: there is no such run, none of its checkpoints is good or left, another process trains it, or `steps`
             are too few.
         Stopped: Ctrl-C or SIGTERM, once a checkpoint is written.
     """
-    changes: dict[str, Any] = {} if steps is None else {"steps": steps}
-    changes |= {} if stop_at == "same" else {"stop_at": stop_at}
+    given = {"steps": "same" if steps is None else steps, "stop_at": stop_at, "step_timeout": step_timeout}
+    changes = {name: value for name, value in given.items() if value != "same"}
     return _go_on(run if isinstance(run, Run) else Run(run), changes, task, callback, agent, own_process, progress)
 
 
@@ -191,7 +193,7 @@ def _check_possible(options: Options, task: Any, own_process: bool) -> None:
     trackers.check(options.track)
     if options.step_timeout and isinstance(task, GymnasiumTask) and options.processes == "auto" and not own_process:
         raise UserError(
-            "step_timeout needs a process for each environment: from Python, give processes='always', and guard the "
+            "step_timeout needs a process for each environment: from Python, give own_process=True, and guard the "
             'script\'s main code with `if __name__ == "__main__":`.'
         )
 
