@@ -197,7 +197,7 @@ def test_a_training_changes_only_a_process_of_its_own(monkeypatch, tmp_path, own
 def test_the_command_line_has_a_process_of_its_own(monkeypatch, tmp_path):
     said = []
 
-    def run(self, restore=None):
+    def run(self, *_, **__):
         said.append(self.own_process)
         self.recorder.close()
         raise UserError("That is enough.")

@@ -59,9 +59,9 @@ def test_a_training_starts_there_without_pretraining_and_needs_the_other_run_no_
     assert not {Phase.PRETRAINING, Phase.COMPILING_PRETRAINING} & set(phases)
     learned = run.folder / "agent.safetensors"
     before, end = learned.read_bytes(), states[-1]
-    for name, array in networks.items():
-        np.testing.assert_array_equal(states[0][name], array)
-    assert any(not np.array_equal(end[name], array) for name, array in networks.items())
+    for name, array in states[0].items():
+        np.testing.assert_array_equal(array, networks[name])
+    assert any(not np.array_equal(end[name], array) for name, array in states[0].items())
     assert Run(run.folder).config["initial"]["seeds"]["5"] == {"seed": 5}
 
     shutil.rmtree(source.folder)  # and as if it was killed before its first checkpoint

@@ -66,7 +66,7 @@ class Session:
         restore: Callable[[SeedState], Snapshot] | None = None,
         networks: dict[str, np.ndarray] | None = None,
     ) -> Run:
-        """Train until the training ends.
+        """Train to the last step, or until something ends the training before it.
 
         Args:
             restore: `Session.restore`, to go on from a checkpoint.
