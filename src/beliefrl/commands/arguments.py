@@ -42,7 +42,9 @@ def agent_options(agent: Any, own: dict[str, Any]) -> type:
     fields = [(name, kind, dataclasses.field(default=default)) for name, (kind, default) in own.items()]
     if agent is None:
         return dataclasses.make_dataclass("Options", fields, frozen=True)
-    hyperparameters = Annotated[type(agent), tyro.conf.arg(prefix_name=False, help="Hyperparameters of the agent.")]
+    hyperparameters = Annotated[
+        type(agent), tyro.conf.OmitArgPrefixes, tyro.conf.arg(help="Hyperparameters of the agent.")
+    ]
     taken = set(_option_names(dataclasses.make_dataclass("Options", fields)))
     for field in dataclasses.fields(agent):
         if field.name in taken:

@@ -66,7 +66,7 @@ def train(argv: Sequence[str]) -> None:
                 (),
             ),
             "training": (
-                Annotated[Options, tyro.conf.arg(prefix_name=False, help="How the training runs.")],
+                Annotated[Options, tyro.conf.OmitArgPrefixes, tyro.conf.arg(help="How the training runs.")],
                 Options(),
             ),
             "out": (

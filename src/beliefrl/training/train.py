@@ -145,6 +145,7 @@ def _go_on(
     begins_again = not was_ever_written(folder) and not (folder / "results.json").exists()
     if not (begins_again or listed(folder)):
         raise UserError(f"{folder} has no checkpoint to go on from any more: train again, with another --out.")
+    _ = Options(**_options(run) | changes)  # raise before the folder is locked
     with contextlib.ExitStack() as showing, contextlib.ExitStack() as stack:
         recorder = stack.enter_context(Recorder(folder, None))
         made = task_of(recorder) if task is None else task
