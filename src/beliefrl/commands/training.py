@@ -10,6 +10,8 @@ import tyro
 from beliefrl import catalogue
 from beliefrl.commands.arguments import OwnAgent, agent_name, agent_options, named_values, own_agent, parse
 
+NewLimit = Annotated[float | Literal["same"] | None, tyro.conf.arg(metavar="FLOAT|None|same")]
+
 
 @dataclasses.dataclass(frozen=True)
 class ResumeOptions:
@@ -19,9 +21,9 @@ class ResumeOptions:
     """The run's folder."""
     steps: int | None = None
     """Total number of environment steps of each seed, at least as many as before. None: as many as before."""
-    stop_at: float | Literal["same"] | None = "same"
+    stop_at: NewLimit = "same"
     """Return at which the training ends, as in `beliefrl train`. None: train for all steps. same: as before."""
-    step_timeout: float | Literal["same"] | None = "same"
+    step_timeout: NewLimit = "same"
     """Maximum number of seconds of a step, as in `beliefrl train`. None: no limit. same: as before."""
     agent: OwnAgent = None
 
