@@ -185,6 +185,7 @@ def load(
     seed: int | None = None,
     task: Task | GymnasiumTask | None = None,
     agent: Agent | type | None = None,
+    best: bool = False,
 ) -> Policy:
     """Load the trained policy of a run.
 
@@ -193,12 +194,13 @@ def load(
         seed: one of the run's seeds; None: its first.
         task: needed only if the run was trained on a task of your own.
         agent: needed only if the run was trained by an agent of your own: its class, or an instance.
+        best: take the seed's best agent, not its last one; see `evaluate`.
 
     Raises:
         UserError: there is no such run or seed, or the run has no trained agent yet.
     """
     run = run if isinstance(run, Run) else Run(run)
-    trained, found, state, precision = restore_seed(run, seed, task, agent)
+    trained, found, state, precision = restore_seed(run, seed, task, agent, best)
     seed = run.seeds[0] if seed is None else seed
     return Policy(trained, found.spec, state, seed, precision, run.config["task"])
 

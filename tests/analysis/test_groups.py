@@ -130,6 +130,23 @@ def test_a_run_is_finished_when_every_seed_was_evaluated_at_the_end_or_has_diver
     np.testing.assert_array_equal(group.curve().seeds, [[1, 2], [1, np.nan]])
 
 
+@pytest.mark.parametrize(
+    ("line", "patience", "reached"),
+    [(2.0, 1, True), (2.1, 1, False), (2.0, 2, False), (1.0, 2, True), (1.0, 3, False), (None, 1, False)],
+)
+def test_a_run_is_finished_when_the_last_evaluations_of_every_seed_reach_the_line(tmp_path, line, patience, reached):
+    run = a_run(tmp_path / "a", [flat(5.0, 5.0), flat(1.0, 2.0)], steps=100)
+    assert run.reached(line, patience) == reached
+    run.config["options"] |= {"stop_at": line, "stop_patience": patience}
+    assert is_finished(run) == reached
+
+
+def test_runs_that_start_from_others_are_a_group_of_their_own(tmp_path):
+    runs = [a_run(tmp_path / name, [flat(1.0)]) for name in ("a", "b")]
+    runs[1].config["options"]["init_from"] = "runs/a"
+    assert [group.label for group in groups(runs)] == ["vrm", "vrm init_from=runs/a"]
+
+
 # Aggregates over tasks, against their definitions (Agarwal et al. 2021).
 
 

@@ -6,6 +6,7 @@ import json
 import pytest
 
 from beliefrl import tasks
+from beliefrl.runs.run import Recorder
 from beliefrl.sweeps import plan as plans
 from beliefrl.sweeps import presets
 from beliefrl.sweeps.files import load, read, write
@@ -59,6 +60,25 @@ def test_first_seeds_come_first():
 def test_seeds_share_a_program_where_that_pays(agent, task, together, runs):
     trainings = plan([Experiment(agent, task, seeds=(2, 0, 1, 5))], together)
     assert [training.seeds for training in trainings] == runs
+
+
+def test_a_sweep_passes_on_how_trainings_start_and_end(tmp_path):
+    settings = {"steps": 40, "stop_at": -200.0, "stop_patience": 2, "init_from": "runs/a", "step_timeout": 5.0}
+    (training,) = plan([Experiment("sac-mlp", "pendulum", settings, seeds=(3,))])
+    command = training.command(tmp_path)
+    for name, value in settings.items():
+        flag = f"--{name.replace('_', '-')}"
+        assert command[command.index(flag) + 1] == str(value)
+    made = tasks.describe(tasks.make("pendulum"))
+    config = {"agent": "sac-mlp", "hyperparameters": {}, **made, "options": training.options}
+    recorder = Recorder(tmp_path / training.name, config)
+    for step, total in ((10, -190.0), (20, -201.0), (30, -150.0)):
+        recorder.log(3, "evaluation", step, {"sampled": [total], "mode": [total]})
+    recorder.finish({})
+    assert not training.is_finished(tmp_path)
+    recorder.log(3, "evaluation", 35, {"sampled": [-200.0], "mode": [-999.0]})
+    assert training.is_finished(tmp_path)
+    recorder.close()
 
 
 def test_a_sweep_that_grows_trains_no_seed_twice():

@@ -86,9 +86,9 @@ def test_a_training_from_python_shows_its_phases_and_evaluations(tmp_path, capsy
     assert f"saved in {tmp_path / 'run'}:" in out
 
 
-def test_without_progress_nothing_is_shown_and_a_report_gets_the_events(tmp_path, capsys):
+def test_without_progress_nothing_is_shown_and_a_callback_gets_the_events(tmp_path, capsys):
     events = []
-    run = train(AGENT, "pendulum", tmp_path / "run", report=events.append, progress=False, **OPTIONS)
+    run = train(AGENT, "pendulum", tmp_path / "run", callback=events.append, progress=False, **OPTIONS)
     evaluate(run, 1, progress=False)
     assert capsys.readouterr() == ("", "")
     assert [event.step for event in events if event.evaluation is not None] == [20, 40]

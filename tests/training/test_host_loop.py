@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from beliefrl import agents, cli, evaluate, load, tasks, train
+from beliefrl import agents, cli, evaluate, load, resume, tasks, train
 from beliefrl.runs.run import Run
 from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
 from beliefrl.tasks.pendulum import Pendulum, PendulumState
@@ -152,6 +152,21 @@ def few(**changes):
     return {"steps": 40, "eval_every": 20, "eval_episodes": 2, "seeds": 2, "seed": 5} | changes
 
 
+@pytest.mark.parametrize("episodes", [2, 3])
+def test_a_training_goes_on_from_a_fault(tmp_path, episodes):
+    """With two episodes its environment fails at step 27 of the training, with three in the first evaluation."""
+    agent, notes = agents.make("sac-mlp", **SHARED, **SMALL["sac-mlp"]), []
+    where = "seed 5" if episodes == 2 else "evaluation of seed 5"
+    with pytest.raises(UserError, match=rf"robot \({where}, step 27\): step raised RuntimeError"):
+        train(agent, GymnasiumTask(Late, "robot"), tmp_path / "run", **few(eval_episodes=episodes))
+    run = resume(tmp_path / "run", task=GymnasiumTask(Fine, "robot"), callback=lambda event: notes.append(event.note))
+    assert f"goes on from the checkpoint of step {26 if episodes == 2 else 20}" in notes
+    for seed in (5, 6):
+        assert [row["step"] for row in run.rows(seed, "evaluation")] == [20, 40]
+        steps = [row["step"] for row in run.rows(seed, "update")]
+        assert (steps[0], steps[-1]) == ((26, 40) if episodes == 2 else (40, 40))
+
+
 def test_what_was_learned_before_a_fault_is_kept(tmp_path):
     agent = agents.make("sac-mlp", **SHARED, **SMALL["sac-mlp"])
     task = GymnasiumTask(Late, "robot")
@@ -181,7 +196,7 @@ def test_a_training_changes_only_a_process_of_its_own(monkeypatch, tmp_path, own
 def test_the_command_line_has_a_process_of_its_own(monkeypatch, tmp_path):
     said = []
 
-    def run(self, restore=None):
+    def run(self, *_, **__):
         said.append(self.own_process)
         self.recorder.close()
         raise UserError("That is enough.")

@@ -1,5 +1,7 @@
 """An environment that does not answer is reported, and a training says what it is doing."""
 
+import re
+import signal
 import threading
 import time
 
@@ -7,10 +9,10 @@ import numpy as np
 import pytest
 
 from beliefrl import UserError, agents, train
-from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
 from beliefrl.training import lockstep
 from beliefrl.training.lockstep import Lockstep
-from beliefrl.training.schedule import Options, stages
+from beliefrl.training.schedule import Options, _processes, stages
 from worlds import SHARED
 from wrong import Fine, raising
 
@@ -42,6 +44,42 @@ def test_a_slow_step_is_reported_once_while_it_goes_on(monkeypatch, processes):
         "robot (step 3): step has not returned for 0 s: it is slow, or it hangs."
     ]
     assert reports[0][0] < ended - 0.1
+
+
+class Stuck(Fine):
+    """Its third step takes a minute if the action is positive, and SIGTERM does not end it."""
+
+    def step(self, action):
+        if self.time == 2 and self.action > 0:
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
+            time.sleep(60)
+        return super().step(action)
+
+
+def test_a_step_that_takes_too_long_is_a_fault_and_names_the_seed(monkeypatch):
+    monkeypatch.setattr(lockstep, "PATIENCE", 0.1)
+    lanes = Lockstep(GymnasiumTask(Stuck, "robot"), ["seed 0", "seed 1"], "always", timeout=3.0)
+    lanes.reset(np.array([0, 1]))
+    actions = np.array([[-1.0], [1.0]], np.float32)
+    lanes.step(actions)
+    lanes.step(actions)
+    message = "robot (step 3): the step of seed 1 has not returned after 3 s, the step_timeout: "
+    began = time.monotonic()
+    with pytest.raises(Fault, match=f"^{re.escape(message)}"):
+        lanes.step(actions)
+    lanes.close()
+    assert time.monotonic() - began < 30
+    assert not any(process.is_alive() for process in lanes._envs.processes)
+
+
+def test_a_time_limit_needs_processes(tmp_path):
+    agent, task = agents.make("sac-mlp", **SHARED, batch_size=8), GymnasiumTask(Fine)
+    for processes in ("auto", "never"):
+        with pytest.raises(UserError, match=r"^step_timeout needs a process for each environment"):
+            train(agent, task, tmp_path / "run", step_timeout=5.0, processes=processes)
+    assert not (tmp_path / "run").exists()
+    assert _processes(Options(step_timeout=5.0), own_process=True) == "always"
+    assert _processes(Options(), own_process=True) == "auto"
 
 
 def test_a_training_reports_a_slow_step(monkeypatch, tmp_path):

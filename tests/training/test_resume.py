@@ -12,6 +12,7 @@ import pytest
 
 from beliefrl import agents, load, resume, train
 from beliefrl.analysis.curves import draw_curve, evaluations
+from beliefrl.analysis.groups import is_finished
 from beliefrl.cli import main
 from beliefrl.runs.arrays import load as load_arrays
 from beliefrl.runs.arrays import packed
@@ -46,7 +47,8 @@ def crash_at(number):
 
 def files(folder):
     """The contents of what a run has learned and logged."""
-    paths = [*sorted((folder / "metrics").iterdir()), folder / "agent.safetensors", folder / "results.json"]
+    names = ("agent.safetensors", "best.safetensors", "results.json")
+    paths = [*sorted((folder / "metrics").iterdir()), *(folder / name for name in names)]
     return {path.name: path.read_bytes() for path in paths}
 
 
@@ -125,7 +127,7 @@ def test_a_training_that_was_killed_before_its_first_checkpoint_begins_again(who
         (folder / "checkpoints" / "replay").mkdir()
         (folder / "checkpoints" / "replay" / "000001.safetensors").write_bytes(b"half")
     if command == "python":
-        resume(folder, report=lambda event: event.note and print(event.note))
+        resume(folder, callback=lambda event: event.note and print(event.note))
     else:
         lines = {"resume": "resume", "train": LINE.replace("--resume ", ""), "train --resume": LINE}
         main([*lines[command].split(), str(folder)])
@@ -254,7 +256,7 @@ def test_an_environment_goes_on_from_the_start_of_an_episode(tmp_path):
     task, notes = GymnasiumTask(Fine, "fine"), []
     with pytest.raises(Crash):
         train(AGENT, task, tmp_path / "run", crash_at(12), **OPTIONS)
-    run = resume(tmp_path / "run", task=task, report=lambda event: notes.append(event.note))
+    run = resume(tmp_path / "run", task=task, callback=lambda event: notes.append(event.note))
     assert any("a new episode begins" in note for note in notes if note)
     assert [row["step"] for row in run.rows(0, "evaluation")] == [120, 240]
     assert {row["length"] for row in run.rows(0, "episode")} == {10}
@@ -322,6 +324,41 @@ def test_the_first_signal_is_a_checkpoint_and_a_word_how_to_go_on(whole, tmp_pat
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
     resume(tmp_path / "run")
     assert files(tmp_path / "run") == files(folder)
+
+
+def test_a_callback_stops_a_training_that_goes_on_to_the_last_bit(whole, tmp_path):
+    notes = []
+
+    def stop(event):
+        notes.append(event.note)
+        return event.evaluation is not None and np.all(event.evaluation.done)
+
+    run = train(AGENT, "pendulum-v", tmp_path / "run", stop, **OPTIONS | {"checkpoint_steps": 0})
+    assert run.results()["step"] == 120
+    assert [note for note in notes if note] == [
+        f"stopped by the callback at step 120; `beliefrl resume {run.folder}` goes on from there, in Python "
+        f"beliefrl.resume({str(run.folder)!r})"
+    ]
+    assert not is_finished(run)
+    resume(run, callback=lambda event: "only True stops it")
+    assert files(run.folder) == files(whole[0])
+
+
+def test_a_training_ends_where_every_seed_has_reached_the_line(whole, tmp_path):
+    first = [np.mean(next(Run(whole[0]).rows(seed, "evaluation"))["sampled"]) for seed in range(2)]
+    folder, notes = tmp_path / "run", []
+    run = train(AGENT, "pendulum-v", folder, lambda event: notes.append(event.note), **OPTIONS, stop_at=min(first))
+    assert run.results()["step"] == 120
+    reached = f"ended at step 120, because the return of every seed was at least {min(first):g}"
+    assert [note for note in notes if note] == [reached]
+    assert is_finished(run)
+    before = files(folder)
+    resume(folder, callback=lambda event: notes.append(event.note))
+    assert notes[-1].startswith(f"this training is finished: it {reached}; `beliefrl resume {folder} --stop-at NUMBER`")
+    assert files(folder) == before
+    main(["resume", str(folder), "--stop-at", "None"])
+    assert files(folder) == files(whole[0])
+    assert Run(folder).options.stop_at is None
 
 
 def test_trainings_in_other_threads_leave_signals_alone(tmp_path):

@@ -91,7 +91,7 @@ def rows(folder, seed, kind):
 def test_a_training_leaves_what_the_documentation_says(trained):
     folder, _ = trained
     files = {"config.json", "metrics", "tensorboard", "checkpoints", "agent.safetensors", "results.json", "curve.png"}
-    files |= {"lock"}
+    files |= {"best.safetensors", "lock"}
     assert {path.name for path in folder.iterdir()} == files
     config = Run(folder).config
     assert (config["agent"], config["task"]) == ("vrm", "pendulum-v")

@@ -11,6 +11,7 @@ import beliefrl
 from beliefrl import tasks
 from beliefrl.cli import main
 from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.training.evaluation import restore_seed
 from beliefrl.types import UserError
 from beliefrl.viewing import films
 from worlds import Counter, saved
@@ -106,8 +107,8 @@ def test_an_mp4_without_its_encoder_is_told_in_a_sentence(tmp_path, run, monkeyp
 
 
 def test_a_strip_is_evenly_spaced_from_the_first_timestep_to_the_last(run):
-    assert list(films._strip(run, 3, None, 0, False, None, None, None).frames) == [0, 2, 5]
-    assert list(films._strip(run, 8, None, 0, False, 3, None, None).frames) == [0, 1, 2, 3]
+    assert list(films._strip(restore_seed(run), 3, 0, False, None).frames) == [0, 2, 5]
+    assert list(films._strip(restore_seed(run), 8, 0, False, 3).frames) == [0, 1, 2, 3]
 
 
 def test_a_strip_says_that_the_numbers_below_its_frames_are_steps(run, monkeypatch):

@@ -102,8 +102,11 @@ def find(paths: Sequence[str | os.PathLike[str]], read: Callable[[pathlib.Path],
 
 
 def is_finished(run: Run) -> bool:
-    """Whether every seed has been evaluated at the last step, or has diverged."""
-    return all(_diverged(run, seed) or last_step(run, seed) >= run.options.steps for seed in run.seeds)
+    """Whether every seed has been evaluated at the last step, or has diverged, or all have reached `stop_at`."""
+    options = run.options
+    if run.reached(options.stop_at, options.stop_patience):
+        return True
+    return all(_diverged(run, seed) or last_step(run, seed) >= options.steps for seed in run.seeds)
 
 
 def last_step(run: Run, seed: int) -> int:
@@ -132,7 +135,9 @@ def groups(runs: Sequence[Run], defaults: Mapping[str, Row] | None = None) -> li
         same_task = [other.config["constants"] for other in runs if task_of(other) == task_of(run)]
         task = " ".join([task_of(run), *_differences(run.config["constants"], same_task)])
         own = results.changed(settings[run.folder], usual[run.config["agent"]])
-        label = " ".join([run.config["agent"], *_differences(own, same_agent)])
+        source = run.config["options"].get("init_from")
+        from_run = [f"init_from={source}"] if source else []
+        label = " ".join([run.config["agent"], *_differences(own, same_agent), *from_run])
         of = seeds.setdefault((task, label), {})
         for seed in run.seeds:
             if seed not in of or _precedence(run, seed) > _precedence(of[seed], seed):

@@ -21,6 +21,13 @@ OwnAgent = Annotated[
         help="The class of the agent, where an agent of your own was trained. Its module is imported.",
     ),
 ]
+Best = Annotated[
+    bool,
+    tyro.conf.arg(
+        help="Use the agent with the highest return of all evaluations during the training (with sampled actions), "
+        "instead of the last one."
+    ),
+]
 
 
 def own_agent(name: str | None) -> type | None:
@@ -35,7 +42,9 @@ def agent_options(agent: Any, own: dict[str, Any]) -> type:
     fields = [(name, kind, dataclasses.field(default=default)) for name, (kind, default) in own.items()]
     if agent is None:
         return dataclasses.make_dataclass("Options", fields, frozen=True)
-    hyperparameters = Annotated[type(agent), tyro.conf.arg(name="", help="Hyperparameters of the agent.")]
+    hyperparameters = Annotated[
+        type(agent), tyro.conf.OmitArgPrefixes, tyro.conf.arg(help="Hyperparameters of the agent.")
+    ]
     taken = set(_option_names(dataclasses.make_dataclass("Options", fields)))
     for field in dataclasses.fields(agent):
         if field.name in taken:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from beliefrl.commands.arguments import OwnAgent, own_agent, parse
+from beliefrl.commands.arguments import Best, OwnAgent, own_agent, parse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +34,7 @@ class PredictOptions:
     """Random seed of the episode, its actions and the samples. The same seed gives the same picture."""
     sampled: bool = False
     """Sample the actions, instead of taking the policy's mode."""
+    best: Best = False
     agent: OwnAgent = None
 
 
@@ -57,6 +58,7 @@ class VideoOptions:
     """Random seed of the first episode. The next episodes have the following seeds."""
     sampled: bool = False
     """Sample the actions, instead of taking the policy's mode."""
+    best: Best = False
     agent: OwnAgent = None
 
 
@@ -80,6 +82,7 @@ class FilmOptions:
     """Random seed of the episodes. The same seed gives the same strip."""
     sampled: bool = False
     """Sample the actions, instead of taking the policy's mode."""
+    best: Best = False
     agent: OwnAgent = None
 
 
@@ -93,7 +96,7 @@ def predict(argv: Sequence[str]) -> None:
     run = Run(options.run)
     path = options.out or run.folder / "predictions.png"
     figures.paths(path)  # raises an error before the episode is played
-    names = ("seed", "model", "start", "horizon", "samples", "episode_seed", "sampled")
+    names = ("seed", "model", "start", "horizon", "samples", "episode_seed", "sampled", "best")
     predicted = predictions(run, agent=own_agent(options.agent), **{name: getattr(options, name) for name in names})
     _written(draw_predictions(predicted, path, options.entries or None))
 
@@ -103,7 +106,7 @@ def video(argv: Sequence[str]) -> None:
     options = parse(VideoOptions, argv, "beliefrl video")
     from beliefrl.viewing import films
 
-    names = ("seed", "episode_seed", "sampled", "episodes", "fps", "steps")
+    names = ("seed", "episode_seed", "sampled", "best", "episodes", "fps", "steps")
     played = films.video(
         options.run, options.out, agent=own_agent(options.agent), **{name: getattr(options, name) for name in names}
     )
@@ -119,7 +122,7 @@ def film(argv: Sequence[str]) -> None:
     options = parse(FilmOptions, argv, "beliefrl film")
     from beliefrl.viewing import films
 
-    names = ("frames", "seed", "episode_seed", "sampled", "steps")
+    names = ("frames", "seed", "episode_seed", "sampled", "best", "steps")
     given = {name: getattr(options, name) for name in names}
     _written(films.film(options.runs, options.out, agent=own_agent(options.agent), **given))
 

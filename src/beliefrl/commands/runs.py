@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from beliefrl.commands.arguments import OwnAgent, own_agent, parse
+from beliefrl.commands.arguments import Best, OwnAgent, own_agent, parse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,6 +23,7 @@ class EvaluateOptions:
     """Random seed of the episodes. The same seed gives the same results."""
     json: bool = False
     """Print one JSON object: for each kind of actions the mean, S.E.M., mean of each seed, and success rates."""
+    best: Best = False
     agent: OwnAgent = None
 
 
@@ -36,6 +37,7 @@ class ExportOptions:
     """The file to write. An existing file is replaced."""
     seed: int | None = None
     """One of the run's seeds. None: its first."""
+    best: Best = False
     agent: OwnAgent = None
 
 
@@ -78,11 +80,13 @@ def evaluate(argv: Sequence[str]) -> None:
     from beliefrl.training.evaluation import evaluate as play
 
     run = Run(options.run)
-    results = play(run, options.episodes, options.seed, agent=own_agent(options.agent), progress=not options.json)
+    agent, shown = own_agent(options.agent), not options.json
+    results = play(run, options.episodes, options.seed, agent=agent, progress=shown, best=options.best)
     if options.json:
         print(json.dumps(results))
         return
-    title = f"{run.config['agent']} on {run.config['task']}, {options.episodes} episodes per seed"
+    which = ", best agents" if options.best else ""
+    title = f"{run.config['agent']} on {run.config['task']}, {options.episodes} episodes per seed{which}"
     Console().print(results_table(results, run.seeds, title))
 
 
@@ -91,5 +95,5 @@ def export(argv: Sequence[str]) -> None:
     options = parse(ExportOptions, argv, "beliefrl export")
     from beliefrl.policy import load
 
-    load(options.run, options.seed, agent=own_agent(options.agent)).export(options.file)
+    load(options.run, options.seed, agent=own_agent(options.agent), best=options.best).export(options.file)
     print(f"written to {options.file}: jax.export.deserialize reads it")

@@ -6,6 +6,7 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
+from beliefrl.runs.best import evaluations
 from beliefrl.runs.checkpoint import listed
 from beliefrl.runs.run import Run
 from beliefrl.training.screen import duration
@@ -33,6 +34,11 @@ def run_table(run: Run, agent: Any) -> Table:
     for seed in run.seeds:
         for entry in run.rows(seed, "diverged"):
             add("diverged", f"seed {seed} by step {entry['step']:,}: {entry.get('why', '?')}")
+    if config.get("initial"):
+        add("initial networks", _origin(config["initial"]))
+    for seed, found in zip(run.seeds, evaluations(run.folder, len(run.seeds)), strict=True):
+        if found is not None:
+            add("best agent", f"seed {seed} at step {found['step']:,}: return {found['return']:.1f} sampled")
     add("checkpoints", ", ".join(path.name for path in listed(run.folder)) or "none")
     for index, session in enumerate([config, *config.get("resumed", ())]):
         began = f"{session.get('started', '?')} to {session.get('ended', '?')}, {session.get('device', '?')}"
@@ -43,6 +49,13 @@ def run_table(run: Run, agent: Any) -> Table:
         add("commit", str(session.get("git_commit")))
         add("versions", versions)
     return table
+
+
+def _origin(initial: dict[str, Any]) -> str:
+    """Where the initial networks of a run come from."""
+    which = "best" if initial.get("best") else "last"
+    source = f"{initial.get('run')} ({initial.get('agent')} on {initial.get('task')})"
+    return f"{which} agent of {source}, commit {initial.get('git_commit')}"
 
 
 def _differs(value: Any, default: Any) -> bool:

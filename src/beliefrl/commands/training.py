@@ -3,12 +3,14 @@
 import dataclasses
 import pathlib
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
 from beliefrl import catalogue
 from beliefrl.commands.arguments import OwnAgent, agent_name, agent_options, named_values, own_agent, parse
+
+NewLimit = Annotated[float | Literal["same"] | None, tyro.conf.arg(metavar="FLOAT|None|same")]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,6 +21,10 @@ class ResumeOptions:
     """The run's folder."""
     steps: int | None = None
     """Total number of environment steps of each seed, at least as many as before. None: as many as before."""
+    stop_at: NewLimit = "same"
+    """Return at which the training ends, as in `beliefrl train`. None: train for all steps. same: as before."""
+    step_timeout: NewLimit = "same"
+    """Maximum number of seconds of a step, as in `beliefrl train`. None: no limit. same: as before."""
     agent: OwnAgent = None
 
 
@@ -67,7 +73,7 @@ def train(argv: Sequence[str]) -> None:
                 Faults(),
             ),
             "training": (
-                Annotated[Options, tyro.conf.arg(name="", help="Length and evaluations.")],
+                Annotated[Options, tyro.conf.OmitArgPrefixes, tyro.conf.arg(help="How the training runs.")],
                 Options(),
             ),
             "out": (
@@ -101,4 +107,11 @@ def resume(argv: Sequence[str]) -> None:
     options = parse(ResumeOptions, argv, "beliefrl resume")
     from beliefrl.training.train import resume as go_on
 
-    go_on(options.run, options.steps, agent=own_agent(options.agent), own_process=True)
+    go_on(
+        options.run,
+        options.steps,
+        agent=own_agent(options.agent),
+        own_process=True,
+        stop_at=options.stop_at,
+        step_timeout=options.step_timeout,
+    )

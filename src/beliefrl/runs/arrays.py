@@ -51,6 +51,24 @@ def read(path: pathlib.Path, like: Any, renamed: Mapping[str, str] = MappingProx
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
 
+def shapes(tree: Any) -> dict[str, Any]:
+    """The shape and type of every array of a tree in a file, by its name."""
+    return {name: jax.eval_shape(_numbers, leaf) for name, leaf in _named(tree)}
+
+
+def about(path: pathlib.Path) -> dict[str, str]:
+    """The words that were written with the arrays of a file (`packed`).
+
+    Raises:
+        Damaged: the file cannot be read.
+    """
+    try:
+        with safetensors.safe_open(path, "numpy") as file:
+            return file.metadata() or {}
+    except (OSError, safetensors.SafetensorError):
+        raise damaged(path) from None
+
+
 def misfit(path: pathlib.Path, name: str) -> UserError:
     """The error that an array of a file is missing, or of another shape or type."""
     return UserError(f"{path} does not fit the agent in config.json (at {name}): they belong to different trainings.")
@@ -65,7 +83,12 @@ def load(path: pathlib.Path) -> dict[str, np.ndarray]:
     try:
         return safetensors.numpy.load_file(path)
     except (OSError, safetensors.SafetensorError):
-        raise Damaged(f"{path} is damaged: restore it from a copy, or train again.") from None
+        raise damaged(path) from None
+
+
+def damaged(path: pathlib.Path) -> Damaged:
+    """The error that a file cannot be read."""
+    return Damaged(f"{path} is damaged: restore it from a copy, or train again.")
 
 
 def _named(tree: Any) -> list[tuple[str, Any]]:

@@ -15,7 +15,7 @@ from beliefrl.types import UserError
 MAKING = r"metrics|lock|\.config\.json\.tmp"  # files that are made before config.json
 UNSAVED = (  # files of a training that has saved no agent and no checkpoint
     rf"{MAKING}|config\.json|metrics/seed-\d+\.jsonl|\.[\w.]+\.tmp|(tensorboard|wandb)(/.*)?"
-    r"|checkpoints(/replay(/.*)?|/\.[^/]*\.tmp(/.*)?)?"
+    r"|initial\.safetensors|checkpoints(/replay(/.*)?|/\.[^/]*\.tmp(/.*)?)?"
 )
 
 

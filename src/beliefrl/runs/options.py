@@ -1,19 +1,20 @@
-"""The options of a training: its length, evaluations and checkpoints, with the range of each option."""
+"""The options of a training: its start, length, evaluations and checkpoints, with the range of each option."""
 
 import dataclasses
 from typing import Literal, get_args
 
 from beliefrl.runs import trackers
-from beliefrl.types import UserError, check_choice, check_range
+from beliefrl.types import LARGEST, UserError, check_choice, check_range
 
 MOST_EPISODES = 100_000  # they run in parallel
+MOST_SECONDS = 1_000_000
 Processes = Literal["auto", "always", "never"]
 Precision = Literal["float32", "tensorfloat32"]  # names in JAX
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """The length of a training, and how it is evaluated and saved."""
+    """Where a training starts and ends, and how it is evaluated and saved."""
 
     steps: int = 20_000
     """Environment steps of each seed, rounded up to whole cycles of the agent."""
@@ -25,12 +26,25 @@ class Options:
     """Environment steps between two evaluations (Appendix B)."""
     eval_episodes: int = 5
     """Episodes in each evaluation with sampled actions, and again with mode actions."""
+    stop_at: float | None = None
+    """End the training when every seed's mean return of an evaluation, with sampled actions, is at least this. None:
+    train for all steps."""
+    stop_patience: int = 1
+    """Number of consecutive evaluations in which the returns must be at least stop_at."""
+    init_from: str | None = None
+    """Folder of a run whose trained agent gives the initial networks. It must have the same agent and sizes. A seed
+    starts from the seed of that number there, or in turn where there are fewer. None: random initial networks."""
+    init_best: bool = False
+    """Take the best agent of init_from instead of its last one."""
     replay_capacity: int = 1_000_000
     """Maximum number of timesteps in a seed's replay. New ones replace the oldest."""
     processes: Processes = "auto"
     """Whether each Gymnasium environment has a process of its own: always, never, or only if a measurement shows that
     this is faster (auto). From Python, auto means never, unless own_process=True. A Python script that uses processes
     must guard its main code with `if __name__ == "__main__":`."""
+    step_timeout: float | None = None
+    """Maximum number of seconds of one step of a Gymnasium environment. If a step takes longer, the training is saved
+    and ends with an error. Each environment then has a process of its own. None: no limit."""
     checkpoint_steps: int = 2_000
     """Environment steps between two checkpoints. 0: no checkpoints by steps."""
     checkpoint_minutes: float = 10.0
@@ -46,7 +60,7 @@ class Options:
 
     def __post_init__(self) -> None:
         """Raise a UserError if a value is impossible."""
-        check_range(self, ("steps", "eval_every", "replay_capacity"), 1)
+        check_range(self, ("steps", "eval_every", "replay_capacity", "stop_patience"), 1)
         check_range(self, ("eval_episodes",), 1, MOST_EPISODES)
         check_range(self, ("checkpoint_steps", "checkpoint_minutes"), 0)
         check_range(self, ("keep_checkpoints",), 1, 1_000_000)
@@ -54,6 +68,17 @@ class Options:
         check_range(self, ("seed",), 0, 2_000_000_000)
         check_choice(self, "processes", get_args(Processes))
         check_choice(self, "precision", get_args(Precision))
+        check_choice(self, "init_best", (True, False))
+        if self.stop_at is not None:
+            check_range(self, ("stop_at",), -LARGEST)
+        if self.init_from is not None and (not isinstance(self.init_from, str) or not self.init_from):
+            raise UserError(f"init_from={self.init_from!r} is impossible: it must be the path of a run's folder.")
+        if self.init_best and self.init_from is None:
+            raise UserError("init_best=True needs init_from: name the run whose best agent is taken.")
+        if self.step_timeout is not None:
+            check_range(self, ("step_timeout",), 0.001, MOST_SECONDS)
+            if self.processes == "never":
+                raise UserError("step_timeout needs a process for each environment: choose processes=always or auto.")
         if not isinstance(self.track, tuple):
             raise UserError(f"track={self.track} is impossible: it must be a tuple of names.")
         for name in self.track:

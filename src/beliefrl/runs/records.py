@@ -129,6 +129,18 @@ def _is_value(value: Any) -> bool:
     return isinstance(value, str) or _is_number(value) or _are_numbers(value)
 
 
+def best_evaluations(text: str, seeds: int) -> list[dict[str, Any] | None] | None:
+    """The best evaluations of `seeds` seeds (`best.evaluations`) in a JSON text; None if it has anything else."""
+    found = _json(text)
+    if not isinstance(found, list) or len(found) != seeds or not all(each is None or _is_best(each) for each in found):
+        return None
+    return found
+
+
+def _is_best(value: Any) -> bool:
+    return isinstance(value, dict) and _is_step(value.get("step")) and _is_number(value.get("return"))
+
+
 def is_summary(results: Any, seeds: int) -> bool:
     """Whether `results` is empty, or the summary of an evaluation (`evaluation.summary`) of `seeds` seeds."""
     if results == {}:

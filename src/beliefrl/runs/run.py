@@ -4,6 +4,8 @@
     metrics/seed-0.jsonl  one line for each entry: {"step", "kind": "update" | "episode" | "evaluation", ...}
     tensorboard/seed-0/   the same entries as TensorBoard events
     agent.safetensors     the agents of all seeds at the last evaluation (leading axis: seed); plain arrays, no code
+    best.safetensors      the same at the evaluation with the highest return of each seed
+    initial.safetensors   the networks of all seeds before the first step, if they come from another run
     results.json          the returns of the last evaluation
     curve.png             the learning curve
 
@@ -17,12 +19,14 @@ import json
 import os
 import pathlib
 from collections.abc import Collection, Iterator
+from statistics import fmean
 from typing import Any
 
 import numpy as np
 
 from beliefrl.runs import arrays, records, trackers
 from beliefrl.runs.arrays import write_whole
+from beliefrl.runs.best import BEST
 from beliefrl.runs.folder import locked, make, write_config
 from beliefrl.runs.options import Options
 from beliefrl.runs.provenance import now
@@ -119,16 +123,42 @@ class Run:
             raise UserError(f"{path} is damaged: restore it from a copy, or remove it.")
         return results
 
-    def load(self, like: Any) -> Any:
-        """The saved agents, in a tree with the structure, shapes and types of `like`.
+    def reached(self, line: float | None, patience: int) -> bool:
+        """Whether the mean returns of every seed (sampled actions) are at least `line` in the last evaluations.
+
+        These are the last `patience` evaluations. Seeds that have diverged do not count. False without a line.
+
+        Raises:
+            UserError: a log cannot be read.
+        """
+        if line is None:
+            return False
+        going = [seed for seed in self.seeds if not any(self.rows(seed, "diverged"))]
+        returns = [[fmean(row["sampled"]) for row in self.rows(seed, "evaluation")][-patience:] for seed in going]
+        return bool(going) and all(len(last) == patience and min(last) >= line for last in returns)
+
+    def load(self, like: Any, best: bool = False) -> Any:
+        """The agents of the last evaluation, or the best ones, in a tree of the structure, shapes and types of `like`.
 
         Raises:
             UserError: no agent was saved yet, or the file is damaged or does not fit `like`.
         """
-        path = self.folder / "agent.safetensors"
-        if not path.exists():
-            raise UserError(f"{self.folder} has no trained agent yet: it is saved at the first evaluation.")
-        return arrays.read(path, like)
+        return arrays.read(self.agents(best), like)
+
+    def agents(self, best: bool = False) -> pathlib.Path:
+        """The file of the agents of the last evaluation, or of the best ones.
+
+        Raises:
+            UserError: it does not exist.
+        """
+        path = self.folder / (BEST if best else "agent.safetensors")
+        if path.exists():
+            return path
+        if best and any(row for seed in self.seeds for row in self.rows(seed, "evaluation")):
+            why = "an older version trained it, which kept only the last agent"
+            raise UserError(f"{self.folder} has no best agent ({why}): leave out --best, in Python best=.")
+        which = "best" if best else "trained"
+        raise UserError(f"{self.folder} has no {which} agent yet: it is saved at the first evaluation.")
 
 
 class Recorder(Run):

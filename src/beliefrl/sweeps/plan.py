@@ -82,11 +82,13 @@ class Training:
         ]
 
     def is_finished(self, sweep: pathlib.Path) -> bool:
-        """Whether the run has been evaluated at its last step."""
+        """Whether the run has been evaluated at its last step, or has reached `stop_at`."""
         folder = sweep / self.name
         if not (folder / "results.json").exists():
             return False
-        return ((Run(folder).results() or {}).get("step") or 0) >= self.steps
+        run, options = Run(folder), Options(**_typed(self.options, Options))
+        has_all_steps = ((run.results() or {}).get("step") or 0) >= self.steps
+        return has_all_steps or run.reached(options.stop_at, options.stop_patience)
 
 
 def grid(

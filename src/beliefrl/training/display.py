@@ -103,8 +103,11 @@ class TrainingDisplay:
         return png.getvalue()
 
     def _ended(self) -> None:
-        """Show the results of a finished training, and its folder."""
-        run, results = self.run, self.run.results() or {}
+        """Show the results of a training, and its folder."""
+        run, results = self.run, self.run.results()
+        if not results:  # stopped before the first evaluation
+            self.screen.show(f"saved in {run.folder}")
+            return
         title = f"{run.config['agent']} on {run.config['task']} after {results['step']:,} steps"
         self.screen.show(results_table(results, run.seeds, title))
         command = f"`beliefrl evaluate {as_argument(run)}`"

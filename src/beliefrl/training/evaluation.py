@@ -46,12 +46,12 @@ def summary(result: Episode, has_success: bool) -> dict[str, Any]:
 
 
 def restore(
-    run: Run, task: Task | GymnasiumTask | None = None, agent: Agent | type | None = None
+    run: Run, task: Task | GymnasiumTask | None = None, agent: Agent | type | None = None, best: bool = False
 ) -> tuple[Agent, Any, Any, str]:
     """The agent, the task, the trained states (leading axis: seed) and the precision (`Run.precision`) of a run.
 
     `task` is needed only where the run was trained on a task of your own, `agent` only where it is of an agent of your
-    own (`agent_of`).
+    own (`agent_of`). The states are those of the last evaluation, or of the best one of each seed.
 
     Raises:
         UserError: the run's agent or task is unknown here, or nothing was saved.
@@ -61,7 +61,7 @@ def restore(
     spec = found.spec
     keys = jax.random.split(jax.random.key(0), len(run.seeds))
     like = jax.eval_shape(jax.vmap(lambda key: made.networks(made.init(key, spec))), keys)
-    return made, found, run.load(like), run.precision
+    return made, found, run.load(like, best), run.precision
 
 
 def restore_seed(
@@ -69,6 +69,7 @@ def restore_seed(
     seed: int | None = None,
     task: Task | GymnasiumTask | None = None,
     agent: Agent | type | None = None,
+    best: bool = False,
 ) -> tuple[Agent, Any, Any, str]:
     """The same of one seed of a run, its first if `seed` is None; see `restore`.
 
@@ -79,7 +80,7 @@ def restore_seed(
     seed = run.seeds[0] if seed is None else seed
     if seed not in run.seeds:
         raise UserError(f"{run.folder} has no seed {seed}: it has {', '.join(map(str, run.seeds))}.")
-    made, found, states, precision = restore(run, task, agent)
+    made, found, states, precision = restore(run, task, agent, best)
     return made, found, jax.tree.map(lambda leaf: leaf[run.seeds.index(seed)], states), precision
 
 
@@ -146,6 +147,7 @@ def evaluate(
     task: Task | GymnasiumTask | None = None,
     agent: Agent | type | None = None,
     progress: bool = True,
+    best: bool = False,
 ) -> dict[str, Any]:
     """Let the trained agents of a run play `episodes` new episodes, once with sampled and once with mode actions.
 
@@ -157,6 +159,8 @@ def evaluate(
         agent: needed only where an agent of your own was trained: its class, or one of them.
         progress: show that episodes are played, while they are: live in a terminal or a notebook; elsewhere a line
             after three seconds, and then once a minute.
+        best: play with the best agent of each seed, not with its last one. It had the highest mean return, with sampled
+            actions, of all evaluations during the training.
 
     Returns:
         {"episodes", "sampled": {"mean", "sem", "seeds", "success", "seeds_success"}, "mode": the same}. Returns are
@@ -170,7 +174,7 @@ def evaluate(
     if not 0 <= seed <= LARGEST:
         raise UserError(f"seed={seed} is impossible: it must be from 0 to {LARGEST}.")
     run = run if isinstance(run, Run) else Run(run)
-    trained, found, states, precision = restore(run, task, agent)
+    trained, found, states, precision = restore(run, task, agent, best)
     keep_compiled()
     keys = jax.random.split(jax.random.key(seed), len(run.seeds))
     with _showing(progress, 2 * episodes * len(run.seeds)) as ended, jax.default_matmul_precision(precision):

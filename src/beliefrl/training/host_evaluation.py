@@ -26,9 +26,11 @@ class Evaluation:
         seeds: Sequence[int],
         processes: str,
         notify: Callable[[str], None] | None = None,
+        timeout: float | None = None,
     ):
-        """The environments are made at the first evaluation; `processes` and `notify` are as in `Lockstep`."""
-        self.agent, self.task, self.seeds, self.processes, self.notify = agent, task, seeds, processes, notify
+        """The environments are made at the first evaluation; the last three arguments are as in `Lockstep`."""
+        self.agent, self.task, self.seeds = agent, task, seeds
+        self._how = processes, notify, timeout
         self.environments: Lockstep | None = None
         lanes = jax.vmap(partial(_perceive, agent, task.spec), in_axes=(None, 0, 0, 0, 0, None))
         self._perceive = jax.jit(jax.vmap(lanes, in_axes=(0, 0, 0, 0, None, None)))
@@ -43,7 +45,7 @@ class Evaluation:
         """`episodes` episodes, one after the other; leaves (seed, 2, episodes). `ended` is called with their count."""
         if self.environments is None:
             lanes = [f"evaluation of seed {seed}" for seed in self.seeds for _ in range(2)]
-            self.environments = Lockstep(self.task, lanes, self.processes, self.notify)
+            self.environments = Lockstep(self.task, lanes, *self._how)
         keys = jax.vmap(lambda key: jax.random.split(key, 2))(keys)
         obs = self.environments.reset(environment_seeds(keys).reshape(-1))
         lanes = len(obs)

@@ -39,10 +39,12 @@ def program(
     seeds: Sequence[int],
     processes: str,
     notify: Callable[[str], None] | None = None,
+    timeout: float | None = None,
 ) -> Program:
-    """The phases of training, with an environment for each of `seeds`; `processes`, `notify`: as in `Lockstep`."""
-    loop = HostLoop(agent, task, capacity, Lockstep(task, [f"seed {seed}" for seed in seeds], processes, notify))
-    evaluation = Evaluation(agent, task, seeds, processes, notify)
+    """The phases of training, with an environment for each of `seeds`; the last three arguments are `Lockstep`'s."""
+    environments = Lockstep(task, [f"seed {seed}" for seed in seeds], processes, notify, timeout)
+    loop = HostLoop(agent, task, capacity, environments)
+    evaluation = Evaluation(agent, task, seeds, processes, notify, timeout)
 
     def close() -> None:
         loop.environments.close()

@@ -22,6 +22,7 @@ from beliefrl.tasks.gymnasium import Environment, Fault, GymnasiumTask
 from beliefrl.types import UserError
 
 HANDOVER = 5e-4  # seconds that giving a step to other processes costs, about
+PATIENCE = 5.0  # seconds in which a process can end by itself
 SLOW = 60.0  # seconds after which a call that has not returned is reported
 
 
@@ -51,6 +52,7 @@ class Lockstep:
         lanes: Sequence[str],
         processes: str = "never",
         notify: Callable[[str], None] | None = None,
+        timeout: float | None = None,
     ):
         """Make an environment for each of `lanes`, the names of the environments in messages.
 
@@ -60,11 +62,13 @@ class Lockstep:
             processes: "always" gives each a process of its own, "never" none, "auto" decides by a measurement.
                 Each process imports the main module of this one: guard it by `if __name__ == "__main__":`.
             notify: called from another thread with a sentence when making, a reset or a step takes longer than SLOW.
+            timeout: most seconds of a step; a longer one raises a Fault. Environments in this process have no limit:
+                nothing can interrupt them.
 
         Raises:
             UserError: the environment cannot be made, or is not supported.
         """
-        self.task, self.lanes = task, lanes
+        self.task, self.lanes, self.timeout = task, lanes, timeout
         self.steps = 0
         self._envs: Any = None
         self._call: _Call | None = None  # the call of the environments that has not returned
@@ -89,7 +93,11 @@ class Lockstep:
         """Step every environment."""
         self.steps += 1
         with self._calling("step"):
-            obs, reward, terminated, truncated, info = self._envs.step(actions)
+            if self.apart:
+                self._envs.step_async(actions)
+                obs, reward, terminated, truncated, info = self._envs.step_wait(self.timeout)
+            else:
+                obs, reward, terminated, truncated, info = self._envs.step(actions)
         return StepResults(obs, reward.astype(np.float32), terminated, truncated, np.asarray(info["success"], bool))
 
     def restart(self, done: Bool[np.ndarray, " lane"]) -> Any:
@@ -103,6 +111,8 @@ class Lockstep:
         if self.apart and self._call is not None:  # a regular close would wait for the step to end
             for process in self._envs.processes:
                 process.terminate()
+                process.join(PATIENCE)
+                process.kill()  # if it ignores that
                 process.join()
             self._envs.closed = True
         with contextlib.suppress(Exception):
@@ -110,7 +120,7 @@ class Lockstep:
 
     @contextlib.contextmanager
     def _calling(self, name: str) -> Iterator[None]:
-        """Note the call that is under way. Raises a Fault if a lane's process dies during it."""
+        """Note the call that is under way. Raises a Fault if a lane's process dies during it, or takes too long."""
         self._call = _Call(name, time.monotonic())
         try:
             with _silence():
@@ -118,6 +128,8 @@ class Lockstep:
             self._call = None
         except (EOFError, ConnectionError, BrokenPipeError):
             raise Fault(self._death()) from None
+        except multiprocessing.TimeoutError:
+            raise Fault(self._delay()) from None
 
     def _watch(self, notify: Callable[[str], None]) -> None:
         """Report every call that takes longer than SLOW, once."""
@@ -130,6 +142,14 @@ class Lockstep:
             at = f" (step {self.steps})" if self.steps else ""
             with contextlib.suppress(Exception):  # an error of the listener must not end the watch
                 notify(f"{self.task.name}{at}: {call.name} has not returned for {SLOW:.0f} s: it is slow, or it hangs.")
+
+    def _delay(self) -> str:
+        late = [lane for lane, pipe in zip(self.lanes, self._envs.parent_pipes, strict=True) if not pipe.poll(0)]
+        who = " and ".join(late) or "one of them"
+        return (
+            f"{self.task.name} (step {self.steps}): the step of {who} has not returned after {self.timeout:g} s, the "
+            "step_timeout: fix the environment, or allow more time."
+        )
 
     def _death(self) -> str:
         dead = []

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
+from beliefrl.runs import best
 from beliefrl.runs.run import Recorder
 from beliefrl.training.evaluation import MODES, summary
 from beliefrl.training.rollout import Episode
@@ -54,6 +55,9 @@ def record(recorder: Recorder, event: Event, has_success: bool, lost: Collection
         recorder.save(event.states, lost)
     if event.evaluation is None:
         return None
+    if event.states is not None:
+        returns = np.asarray(event.evaluation.episode_return)[:, MODES.index("sampled")].mean(axis=-1).tolist()
+        best.save(recorder.folder, event.states, event.step, returns)
     return {"step": event.step} | summary(event.evaluation, has_success)
 
 

@@ -5,14 +5,14 @@ happens, `train` records it in a run's folder.
 """
 
 import enum
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from beliefrl.agents import Agent
-from beliefrl.runs.options import Options
+from beliefrl.runs.options import Options, Processes
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
 from beliefrl.training import host_loop, phases
@@ -87,7 +87,8 @@ def stages(
     restore: Callable[[SeedState], Snapshot] | None = None,
     notify: Callable[[str], None] | None = None,
     own_process: bool = False,
-) -> Iterator[Event]:
+    initial: Callable[[Any], Any] | None = None,
+) -> Generator[Event, None, None]:
     """Train; yields an Event before whatever takes long and after whatever has results.
 
     Args:
@@ -97,6 +98,8 @@ def stages(
         restore: given the shapes of a training's arrays, returns the snapshot to go on from.
         notify: called from another thread with a sentence that cannot wait for the next Event.
         own_process: as in `train`.
+        initial: given the agents' random first states, returns the states to start from (`initial.started`). There is
+            no pre-training then: its result came with them.
 
     Raises:
         Fault: of a Gymnasium environment, after an Event with what was learned until then.
@@ -107,24 +110,30 @@ def stages(
         yield Event(Phase.MAKING_ENVIRONMENTS, 0)
         if own_process:
             host_loop.keep_memory()
-        processes = options.processes if own_process or options.processes == "always" else "never"
-        program = host_loop.program(agent, task, *sizes, numbers, processes, notify)
+        processes = _processes(options, own_process)
+        program = host_loop.program(agent, task, *sizes, numbers, processes, notify, options.step_timeout)
     else:
         program = phases.compile_program(agent, task, *sizes)
-    keys = jax.vmap(jax.random.key)(np.array(numbers))
+    keys, at = jax.vmap(jax.random.key)(np.array(numbers)), TrainingProgress(refreshed=initial is not None)
     try:
         if restore is None:
             yield Event(Phase.COMPILING_AGENT, 0)
-            start = Snapshot(TrainingProgress(), program.begin(keys))
+            seeds = program.begin(keys)
+            seeds = seeds if initial is None else seeds._replace(state=initial(seeds.state))
         else:
             at, seeds = restore(program.shapes(keys))
-            start = Snapshot(at, program.revive(seeds, at.step))
-        yield from _stages(agent, program, options, *start)
+            seeds = program.revive(seeds, at.step)
+        for event in _stages(agent, program, options, at, seeds):
+            at = at if event.snapshot is None else event.snapshot.progress
+            yield event
     except Fault as fault:
         if fault.seeds is not None:
             metrics, episodes = fault.stretch or ({}, None)
-            learned = fault.seeds.state if fault.step >= agent.step_start_rl else None
-            yield Event(Phase.FAULT, fault.step, metrics, episodes, states=learned)
+            event = Event(Phase.FAULT, fault.step, metrics, episodes)
+            if fault.step >= agent.step_start_rl:
+                snapshot = Snapshot(at._replace(step=fault.step), fault.seeds)
+                event = event._replace(states=fault.seeds.state, snapshot=snapshot)
+            yield event
         raise
     finally:
         program.close()
@@ -136,6 +145,10 @@ def _stages(
     explored = min(agent.step_start_rl, options.steps)
     stretch = phases.stretch_length(agent)
 
+    if at.evaluated // options.eval_every < at.step // options.eval_every:  # an environment failed in this evaluation
+        yield from _evaluation(program, seeds, at.step, Phase.LEARNING)
+        at = at._replace(evaluated=at.step)
+        yield Event(Phase.LEARNING, at.step, snapshot=Snapshot(at, seeds))
     if at.step < explored:
         yield Event(Phase.COMPILING_EXPLORATION, at.step)
         seeds, _ = program.explore(seeds, at.step, 0)
@@ -163,6 +176,7 @@ def _stages(
             part = at.pretrained, agent.pretrain_updates
             yield Event(Phase.PRETRAINING, at.step, means, part=part, snapshot=Snapshot(at, seeds))
         seeds, at = program.refresh(seeds), at._replace(refreshed=True)
+        yield Event(Phase.PRETRAINING, at.step, snapshot=Snapshot(at, seeds))
 
     if at.step < options.steps:
         yield Event(Phase.COMPILING_LEARNING, at.step)
@@ -198,6 +212,15 @@ def capacity(agent: Agent, options: Options) -> int:
     if options.steps > agent.step_start_rl and options.replay_capacity < needed:
         raise UserError(f"replay_capacity={options.replay_capacity} is too small: this agent needs at least {needed}.")
     return min(options.replay_capacity, max(int(ROOM * options.steps), min(needed, 2 * options.steps)))
+
+
+def _processes(options: Options, own_process: bool) -> Processes:
+    """Whether environments have processes of their own, where "auto" depends on the program and on a time limit."""
+    if options.processes != "auto":
+        return options.processes
+    if not own_process:
+        return "never"
+    return "auto" if options.step_timeout is None else "always"
 
 
 def _until(step: int, every: int) -> int:

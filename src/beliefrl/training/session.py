@@ -1,8 +1,12 @@
-"""A training while it runs: its log, its checkpoints, seeds that diverge, and the stop that a signal asks for.
+"""A training while it runs: its log, its checkpoints, seeds that diverge, and what ends it before its last step.
+
+A signal or the user's callback stops it, and it can be resumed. With the option `stop_at` it is finished when the
+returns are high enough.
 
 `schedule.stages` trains and yields events; the code here records them.
 """
 
+import contextlib
 import time
 from collections.abc import Callable
 from functools import partial
@@ -18,7 +22,7 @@ from beliefrl.runs.checkpoint import Checkpoints
 from beliefrl.runs.options import Options
 from beliefrl.runs.run import Recorder, Run
 from beliefrl.tasks.gymnasium import GymnasiumTask
-from beliefrl.training import log
+from beliefrl.training import initial, log
 from beliefrl.training.compilation import keep_compiled
 from beliefrl.training.evaluation import as_argument
 from beliefrl.training.phases import SeedState
@@ -26,7 +30,7 @@ from beliefrl.training.schedule import Event, Phase, Snapshot, TrainingProgress,
 from beliefrl.training.stop import Requests, Stopped
 from beliefrl.types import UserError
 
-Report = Callable[[Event], Any]
+Callback = Callable[[Event], Any]  # returns True to stop the training
 RENAMED = {".actor.episode_return": ".actor.total"}  # arrays in checkpoints: the present name, the old one
 
 
@@ -39,25 +43,40 @@ class Session:
         agent: Agent,
         task: Any,
         options: Options,
-        report: Report,
+        callback: Callback,
         own_process: bool,
     ):
         self.recorder, self.agent, self.task, self.options = recorder, agent, task, options
         self.own_process = own_process
-        self.report = report
+        self.callback = callback
         self.has_success = task.spec.has_success
         self.checkpoints = Checkpoints(recorder.folder, options.keep_checkpoints)
-        self.last, self.saved_at = TrainingProgress(), time.monotonic()
+        self.given = "initial" in recorder.config  # whether the first networks come from another run
+        self.last, self.saved_at = TrainingProgress(refreshed=self.given), time.monotonic()
         self.results = recorder.results()
         self.lost: set[int] = set()  # indices of the seeds that have diverged
         self.step = 0
+        self.is_stopped = False  # by the callback
+        self.ended: str | None = None  # why the training is finished before its last step, a sentence
+        self.was_finished = False  # before it was resumed
         self.requests = Requests(partial(self._note, "stopping after this stretch; Ctrl-C again ends at once"))
 
-    def run(self, restore: Callable[[SeedState], Snapshot] | None = None) -> Run:
-        """Train to the end, or until a signal."""
+    def run(
+        self,
+        restore: Callable[[SeedState], Snapshot] | None = None,
+        networks: dict[str, np.ndarray] | None = None,
+    ) -> Run:
+        """Train to the last step, or until something ends the training before it.
+
+        Args:
+            restore: `Session.restore`, to go on from a checkpoint.
+            networks: the first networks of a new training, if they come from another run (`initial.taken`).
+        """
         keep_compiled(self._note)
         try:
             with self.recorder, jax.default_matmul_precision(self.options.precision):
+                if networks is not None:
+                    initial.write(self.recorder.folder, networks)
                 self._train(restore)
         except BrokenPipeError:  # the reader of the output has closed it
             raise
@@ -70,11 +89,15 @@ class Session:
 
     def _train(self, restore: Callable[[SeedState], Snapshot] | None) -> None:
         try:
-            with self.checkpoints, self.requests:
-                for event in stages(self.agent, self.task, self.options, restore, self._note, self.own_process):
-                    self._listen(event)
-            self.recorder.finish(self.results or {})
-            draw_curve(self.recorder)
+            start = partial(initial.started, self.recorder.folder, self.agent) if self.given else None
+            events = stages(self.agent, self.task, self.options, restore, self._note, self.own_process, start)
+            with self.checkpoints, self.requests, contextlib.closing(events):
+                for event in events:
+                    if self.was_finished or self._listen(event):
+                        break
+            if self.results:
+                self.recorder.finish(self.results)
+                draw_curve(self.recorder)
         finally:
             self.recorder.note_end()
 
@@ -89,16 +112,25 @@ class Session:
         like = shapes._replace(replay=ring._replace(timesteps=()))
         found = self.checkpoints.restore(like, ring.timesteps, RENAMED)
         for why in found.passed_over:
-            self.report(Event(Phase.RESUMING, found.step, note=f"{why} The checkpoint before it is used."))
+            self._report(Event(Phase.RESUMING, found.step, note=f"{why} The checkpoint before it is used."))
         self.recorder.rewind({int(seed): length for seed, length in found.progress["metrics"].items()})
         self.last, self.lost = TrainingProgress(*found.progress["progress"]), set(found.progress["lost"])
-        self.report(Event(Phase.RESUMING, found.step, note=f"goes on from the checkpoint of step {found.step:,}"))
+        self.results = found.progress.get("results", self.results)
+        self.ended = self._reached(found.step)
+        self.was_finished = self.ended is not None
+        notes = [f"goes on from the checkpoint of step {found.step:,}"]
         if isinstance(self.task, GymnasiumTask):
-            self.report(Event(Phase.RESUMING, found.step, note="a new episode begins: an environment cannot be saved"))
+            notes.append("a new episode begins: an environment cannot be saved")
+        if self.ended:
+            go_on = f"`beliefrl resume {as_argument(self.recorder)} --stop-at NUMBER` goes on to a higher return"
+            notes = [f"this training is finished: it {self.ended}; {go_on}, with None to its last step"]
+        for note in notes:
+            self._report(Event(Phase.RESUMING, found.step, note=note))
         seeds = found.tree._replace(replay=found.tree.replay._replace(timesteps=found.timesteps))
         return Snapshot(self.last, jax.tree.map(jnp.asarray, seeds))
 
-    def _listen(self, event: Event) -> None:
+    def _listen(self, event: Event) -> bool:
+        """Record an event; returns whether the training ends with it, before its last step."""
         self.step = event.step
         self._look_for_divergence(event)
         if event.evaluation is not None and self.lost:
@@ -106,13 +138,30 @@ class Session:
         if event.states is not None:
             event = event._replace(states=self.agent.networks(event.states))
         self.results = log.record(self.recorder, event, self.has_success, self.lost) or self.results
-        self.report(event)
-        if event.snapshot is not None:
-            self._consider(event.snapshot)
+        if event.evaluation is not None:
+            self.ended = self._reached(event.step)
+        self._report(event)
+        return event.snapshot is not None and self._consider(event, event.snapshot)
+
+    def _report(self, event: Event) -> None:
+        """Give an event to the callback, which may ask for a stop."""
+        answer = self.callback(event)
+        is_flag = isinstance(answer, bool | np.bool_ | jax.Array) and np.asarray(answer).dtype == np.bool_
+        if is_flag and bool(answer):
+            self.is_stopped = True
 
     def _note(self, note: str) -> None:
         """Report a note at once, from any thread."""
-        self.report(Event(Phase.TRAINING, self.step, note=note))
+        self._report(Event(Phase.TRAINING, self.step, note=note))
+
+    def _reached(self, step: int) -> str | None:
+        """What to say if the returns have reached `stop_at` at this step."""
+        line, patience = self.options.stop_at, self.options.stop_patience
+        if not self.recorder.reached(line, patience):
+            return None
+        whose = "the return" if len(self.recorder.seeds) == 1 else "the return of every seed"
+        when = "" if patience == 1 else f" in {patience} consecutive evaluations"
+        return f"ended at step {step:,}, because {whose} was at least {line:g}{when}"
 
     def _look_for_divergence(self, event: Event) -> None:
         """Drop seeds whose losses or networks are no longer finite; the others go on."""
@@ -121,11 +170,11 @@ class Session:
         }
         for name, values in losses.items():
             self._lose(np.flatnonzero(~np.isfinite(values)), event, f"{name} is not finite")
-        states = event.states
-        if event.snapshot is not None and self._is_due(event.snapshot):
-            states = event.snapshot.seeds.state
-        if states is not None:
-            self._lose(np.flatnonzero(~np.asarray(log.finite(states))), event, "its networks are not finite")
+        if event.states is not None:
+            self._look_at_networks(event.states, event)
+
+    def _look_at_networks(self, states: Any, event: Event) -> None:
+        self._lose(np.flatnonzero(~np.asarray(log.finite(states))), event, "its networks are not finite")
 
     def _lose(self, indices: np.ndarray, event: Event, why: str) -> None:
         for index in indices:
@@ -139,37 +188,54 @@ class Session:
             note = f"seed {seed} diverged by step {event.step:,}: {why}; {where}."
             if len(self.lost) == len(self.recorder.seeds):
                 raise UserError(f"All seeds have diverged; {note} Try smaller learning rates.")
-            self.report(Event(event.phase, event.step, note=note))
+            self._report(Event(event.phase, event.step, note=note))
 
-    def _is_due(self, snapshot: Snapshot) -> bool:
+    def _is_due(self, event: Event, snapshot: Snapshot) -> bool:
         """Whether a checkpoint is due."""
         progress, options = snapshot.progress, self.options
         steps = progress.step - self.last.step >= options.checkpoint_steps > 0
         minutes = time.monotonic() - self.saved_at >= 60 * options.checkpoint_minutes > 0
         refreshed = progress.refreshed and not self.last.refreshed
-        return bool(steps or minutes or refreshed or self._has_ended(progress) or self.requests.number)
+        ends = self._has_ended(progress) or self.ended or self.is_stopped or self.requests.number
+        return bool(steps or minutes or refreshed or ends or event.phase is Phase.FAULT)
 
     def _has_ended(self, progress: TrainingProgress) -> bool:
         return progress.step >= self.options.steps and progress.evaluated == progress.step
 
-    def _consider(self, snapshot: Snapshot) -> None:
-        """Write a checkpoint if one is due; stop if a signal asked for it."""
-        if not self._is_due(snapshot):
-            return
+    def _consider(self, event: Event, snapshot: Snapshot) -> bool:
+        """Write a checkpoint if one is due; returns whether the training ends with it, before its last step.
+
+        Raises:
+            Stopped: a signal asked for it.
+        """
+        if not self._is_due(event, snapshot):
+            return False
+        self._look_at_networks(snapshot.seeds.state, event)  # no checkpoint has networks that were not looked at
         progress, asked = snapshot.progress, self.requests.number
         if progress.refreshed and not self.last.refreshed:
             self.checkpoints.forget_timesteps()
         self._save(snapshot)
-        if asked and not self._has_ended(progress):
+        if self._has_ended(progress):
+            return False
+        go_on = f"`beliefrl resume {as_argument(self.recorder)}` goes on from there"
+        go_on = f"{go_on}, in Python beliefrl.resume({str(self.recorder.folder)!r})"
+        if event.phase is Phase.FAULT:
+            with contextlib.suppress(UserError):  # the fault itself is raised next
+                self.checkpoints.wait()
+                self._note(f"saved at step {progress.step:,}; {go_on}")
+        elif asked:
             self.checkpoints.wait()
-            go_on = f"`beliefrl resume {as_argument(self.recorder)}` goes on from there"
-            in_python = f"in Python beliefrl.resume({str(self.recorder.folder)!r})"
-            raise Stopped(f"stopped at step {progress.step:,}; {go_on}, {in_python}.", asked)
+            raise Stopped(f"stopped at step {progress.step:,}; {go_on}.", asked)
+        elif self.ended or self.is_stopped:
+            self._note(self.ended or f"stopped by the callback at step {progress.step:,}; {go_on}")
+            return True
+        return False
 
     def _save(self, snapshot: Snapshot) -> None:
         replay = snapshot.seeds.replay
         rest = snapshot.seeds._replace(replay=replay._replace(timesteps=()))
         lost = sorted(self.lost)
         progress = {"progress": list(snapshot.progress), "metrics": self.recorder.lengths(), "lost": lost}
+        progress["results"] = self.results
         self.checkpoints.save(snapshot.progress.step, progress, rest, replay.timesteps, np.asarray(replay.added))
         self.last, self.saved_at = snapshot.progress, time.monotonic()

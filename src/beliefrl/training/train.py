@@ -8,7 +8,7 @@ import dataclasses
 import json
 import os
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Literal
 
 from beliefrl import agents, tasks
 from beliefrl.agents import Agent, hyperparameters
@@ -19,20 +19,24 @@ from beliefrl.runs.provenance import provenance
 from beliefrl.runs.run import Recorder, Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.training import initial
 from beliefrl.training.evaluation import agent_of, task_of, tuples
-from beliefrl.training.schedule import Options, capacity
-from beliefrl.training.session import Report, Session
+from beliefrl.training.schedule import Event, Options, capacity
+from beliefrl.training.session import Callback, Session
 from beliefrl.types import UserError
+
+CHANGEABLE = ("steps", "stop_at", "stop_patience", "step_timeout")  # options that may differ when a training goes on
 
 
 def train(
     agent: Agent | str,
     task: Task | GymnasiumTask | str,
     out: str | os.PathLike[str] | None = None,
-    report: Report | None = None,
+    report: Callback | None = None,
     own_process: bool = False,
     progress: bool = True,
     resume: bool = False,
+    callback: Callback | None = None,
     **options: Any,
 ) -> Run:
     """Train an agent on a task and record it in a folder.
@@ -42,19 +46,24 @@ def train(
         task: a task, or the name of one.
         out: the run's folder; None is runs/AGENT-TASK-1, or the next free number. It must not exist, unless it is empty
             or a training left it that ended before it saved an agent or a checkpoint; then it is used again.
-        report: called with every Event as it happens. Urgent notes come from another thread.
+        report: called with every Event when it happens; what it returns is ignored.
+        callback: the same, but it can stop the training. If it returns True, the training writes a checkpoint after
+            its current stretch of about 100 steps and stops; `resume` goes on. Any other value, such as None, changes
+            nothing. (In Stable-Baselines3 a callback returns False to stop.) Urgent notes come from another thread.
+            An exception of the callback ends the training; what was saved stays.
         own_process: True says that this process only trains, and that it guards its main module (`if __name__ == ...`).
             Then processes="auto" may start processes, and training on a Gymnasium environment lets the C library keep
             freed memory. The command line says so.
         progress: show what the training does: live in a terminal, live with the learning curve in a notebook, elsewhere
             a line for each phase and each evaluation, and at least one a minute. False shows nothing.
         resume: go on with the training in `out`, if there is one already. It must have been started with the same
-            agent, task and options; `steps` may be larger.
-        options: the fields of `Options`: steps, seeds, seed, eval_every, eval_episodes, replay_capacity, processes,
-            checkpoint_steps, checkpoint_minutes, keep_checkpoints, precision, track.
+            agent, task and options. `steps` may be larger; stop_at, stop_patience and step_timeout may be different.
+        options: the fields of `Options`: steps, seeds, seed, eval_every, eval_episodes, stop_at, stop_patience,
+            init_from, init_best, replay_capacity, processes, step_timeout, checkpoint_steps, checkpoint_minutes,
+            keep_checkpoints, precision, track. init_from may be a Run.
 
     Returns:
-        The finished run: its results, its log, its files (`runs`).
+        The run: its results, its log, its files (`runs`). It is finished, unless the callback has stopped it.
 
     Raises:
         UserError: an unknown name or option, an impossible value, `out` exists (with `resume`: and was trained
@@ -64,12 +73,9 @@ def train(
     """
     agent = agents.make(agent) if isinstance(agent, str) else agent
     made: Any = tasks.make(task) if isinstance(task, str) else task
-    known = [field.name for field in dataclasses.fields(Options)]
-    for name in options:
-        if name not in known:
-            raise UserError(f"Training has no option {name!r}: it has {', '.join(known)}.")
-    chosen = Options(**options)
-    _ = capacity(agent, chosen), made.spec, trackers.check(chosen.track)  # raise before the folder is made
+    chosen = _chosen(options)
+    _ = capacity(agent, chosen), made.spec  # raise before the folder is made
+    _check_possible(chosen, made, own_process)
     config = {
         "agent": agents.name_of(agent),
         "hyperparameters": hyperparameters.of(agent),
@@ -80,20 +86,27 @@ def train(
     if resume and out is not None and os.path.exists(os.path.join(out, "config.json")):  # noqa: PTH110, PTH118 - pathlib's raises where a name is too long
         run, own = Run(out), agent if agents.is_own(config["agent"]) else None
         _check_same(run, config)
-        return _go_on(run, chosen.steps, made, report, own, own_process, progress)
+        changes = {name: getattr(chosen, name) for name in CHANGEABLE}
+        return _go_on(run, changes, made, (report, callback), own, own_process, progress)
+    networks = None
+    if chosen.init_from is not None:
+        networks, config["initial"] = initial.taken(chosen, agent, made.spec)
     recorder = Recorder(out or free_folder(f"{config['agent']}-{config['task']}"), config)
-    with _reporting(recorder, report, progress) as listen:
-        return Session(recorder, agent, made, chosen, listen, own_process).run()
+    with _reporting(recorder, report, callback, progress) as listen:
+        return Session(recorder, agent, made, chosen, listen, own_process).run(networks=networks)
 
 
 def resume(
     run: Run | str | os.PathLike[str],
     steps: int | None = None,
     task: Task | GymnasiumTask | None = None,
-    report: Report | None = None,
+    report: Callback | None = None,
     agent: Agent | type | None = None,
     own_process: bool = False,
     progress: bool = True,
+    callback: Callback | None = None,
+    stop_at: float | Literal["same"] | None = "same",
+    step_timeout: float | Literal["same"] | None = "same",
 ) -> Run:
     """Go on with a training from its last checkpoint.
 
@@ -105,34 +118,49 @@ def resume(
         run: a run, or its folder.
         steps: train for so many environment steps in all; None: as many as before. They may only grow.
         task: needed only where the run was trained on a task of your own.
-        report, own_process, progress: as in `train`.
+        report, own_process, progress, callback: as in `train`.
         agent: needed only where an agent of your own was trained: its class, or an instance.
+        stop_at: the option `stop_at` from now on; None: train for all steps; "same": as before. A training that has
+            reached its `stop_at` is finished, and goes on only with a higher one or None.
+        step_timeout: the option `step_timeout` from now on; None: no limit; "same": as before.
 
     Raises:
         UserError: there is no such run, none of its checkpoints is good or left, another process trains it, or `steps`
             are too few.
         Stopped: Ctrl-C or SIGTERM, once a checkpoint is written.
     """
-    return _go_on(run if isinstance(run, Run) else Run(run), steps, task, report, agent, own_process, progress)
+    given = {"steps": "same" if steps is None else steps, "stop_at": stop_at, "step_timeout": step_timeout}
+    changes = {name: value for name, value in given.items() if value != "same"}
+    run = run if isinstance(run, Run) else Run(run)
+    return _go_on(run, changes, task, (report, callback), agent, own_process, progress)
 
 
 def _go_on(
-    run: Run, steps: int | None, task: Any, report: Report | None, agent: Any, own_process: bool, progress: bool
+    run: Run,
+    changes: dict[str, Any],
+    task: Any,
+    listeners: tuple[Callback | None, Callback | None],
+    agent: Any,
+    own_process: bool,
+    progress: bool,
 ) -> Run:
+    """Go on with a training; `changes` are its new options, `listeners` are `report` and `callback`."""
     folder, made_by = run.folder, agent_of(run, agent)
     begins_again = not was_ever_written(folder) and not (folder / "results.json").exists()
     if not (begins_again or listed(folder)):
         raise UserError(f"{folder} has no checkpoint to go on from any more: train again, with another --out.")
+    _ = Options(**_options(run) | changes)  # raise before the folder is locked
     with contextlib.ExitStack() as showing, contextlib.ExitStack() as stack:
         recorder = stack.enter_context(Recorder(folder, None))
         made = task_of(recorder) if task is None else task
         before = _options(recorder)
-        if steps is not None and steps < before["steps"]:
+        steps = changes.get("steps", before["steps"])
+        if steps < before["steps"]:
             raise UserError(f"steps={steps} is impossible: {folder} trains for {before['steps']}, and may only grow.")
-        options = dataclasses.replace(Options(**before), **({} if steps is None else {"steps": steps}))
-        trackers.check(options.track)
+        options = Options(**before | changes)
+        _check_possible(options, made, own_process)
         recorder.amend({"options": dataclasses.asdict(options)}, provenance())
-        listen = showing.enter_context(_reporting(recorder, report, progress))
+        listen = showing.enter_context(_reporting(recorder, *listeners, progress))
         training = Session(recorder, made_by, made, options, listen, own_process)
         if begins_again:
             training.begin_again()
@@ -141,25 +169,56 @@ def _go_on(
 
 
 @contextlib.contextmanager
-def _reporting(run: Run, report: Report | None, progress: bool) -> Iterator[Report]:
-    """What is called with every Event: the display, unless `progress` is False, and `report`."""
+def _reporting(run: Run, report: Callback | None, callback: Callback | None, progress: bool) -> Iterator[Callback]:
+    """What is called with every Event: the display, unless `progress` is False, `report`, and `callback`.
+
+    It returns what `callback` returns.
+    """
     with contextlib.ExitStack() as stack:
-        listeners = [] if report is None else [report]
+        shown = [] if report is None else [report]
         if progress:
             from beliefrl.training.display import TrainingDisplay
             from beliefrl.training.screen import screen
 
-            listeners.insert(0, stack.enter_context(TrainingDisplay(screen(), run)))
-        yield lambda event: [listen(event) for listen in listeners]
+            shown.insert(0, stack.enter_context(TrainingDisplay(screen(), run)))
+
+        def listen(event: Event) -> Any:
+            for show in shown:
+                show(event)
+            return None if callback is None else callback(event)
+
+        yield listen
+
+
+def _chosen(options: dict[str, Any]) -> Options:
+    """The options that were given by name."""
+    known = [field.name for field in dataclasses.fields(Options)]
+    for name in options:
+        if name not in known:
+            raise UserError(f"Training has no option {name!r}: it has {', '.join(known)}.")
+    source = options.get("init_from")
+    path = source.folder if isinstance(source, Run) else source
+    chosen: dict[str, Any] = options | {"init_from": str(path) if isinstance(path, os.PathLike) else path}
+    return Options(**chosen)
+
+
+def _check_possible(options: Options, task: Any, own_process: bool) -> None:
+    """Raise a UserError if options need a package, or processes, that are not there."""
+    trackers.check(options.track)
+    if options.step_timeout and isinstance(task, GymnasiumTask) and options.processes == "auto" and not own_process:
+        raise UserError(
+            "step_timeout needs a process for each environment: from Python, give own_process=True, and guard the "
+            'script\'s main code with `if __name__ == "__main__":`.'
+        )
 
 
 def _check_same(run: Run, config: dict[str, Any]) -> None:
-    """Raise a UserError where a run was trained with other settings than `config` has; steps may differ."""
+    """Raise a UserError where a run was trained with other settings than `config` has, but for CHANGEABLE options."""
     asked = {name: config.get(name) for name in ("agent", "task", "constants", "observe", "faults")}
     asked = asked | config["options"] | config["hyperparameters"]
     asked = json.loads(json.dumps(asked, default=str))  # tuples are lists in the run's config
     there = {"faults": None} | run.config | run.config["options"] | run.config["hyperparameters"]
-    there["steps"] = asked["steps"]
+    there |= {name: asked[name] for name in CHANGEABLE}
     for name, value in asked.items():
         if there.get(name, value) != value:
             change = "choose another --out, in Python out="

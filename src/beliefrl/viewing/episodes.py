@@ -123,6 +123,7 @@ def play(
     at: Container[int] = (),
     task: Task | GymnasiumTask | None = None,
     agent: Agent | type | None = None,
+    best: bool = False,
 ) -> Trajectory:
     """Play an episode with the trained agent of a run.
 
@@ -136,12 +137,13 @@ def play(
             empty.
         task: needed only if the run was trained on a task of your own.
         agent: needed only if the run was trained by an agent of your own: its class, or an instance.
+        best: take the seed's best agent, not its last one; see `evaluate`.
 
     Raises:
         UserError: there is no such run or seed, a number is impossible, or the task fails or cannot be rendered.
     """
     check_episode(episode_seed, steps)
-    with Player(*restore_seed(run, seed, task, agent), rendered=bool(at)) as player:
+    with Player(*restore_seed(run, seed, task, agent, best), rendered=bool(at)) as player:
         return player.play(episode_seed, sampled, steps, at)
 
 

@@ -44,6 +44,7 @@ def video(
     steps: int | None = None,
     task: Task | GymnasiumTask | None = None,
     agent: Agent | type | None = None,
+    best: bool = False,
 ) -> list[Trajectory]:
     """Record a video of a run's trained agent; returns the episodes, without frames. No file is left half written.
 
@@ -59,6 +60,7 @@ def video(
         steps: stop each episode after this many steps; None: play until the task ends it.
         task: needed only if the run was trained on a task of your own.
         agent: needed only if the run was trained by an agent of your own: its class, or an instance.
+        best: take the seed's best agent, not its last one; see `evaluate`.
 
     Raises:
         UserError: there is no such run or seed, a number is impossible, the task cannot be rendered, imageio-ffmpeg is
@@ -72,7 +74,7 @@ def video(
         raise UserError(f"fps={fps} is impossible: it must be a number above 0 and up to 1000.")
     kind = _kind(path)
     figures.check_folder(path)
-    with Player(*restore_seed(run, seed, task, agent), rendered=True) as player:
+    with Player(*restore_seed(run, seed, task, agent, best), rendered=True) as player:
         pace = rendering.pace(player.environment)
         every = 1 if fps else math.ceil(pace / FASTEST)
         with _encoder(path, kind, fps or pace / every) as add:
@@ -197,6 +199,7 @@ def film(
     steps: int | None = None,
     task: Task | GymnasiumTask | None = None,
     agent: Agent | type | None = None,
+    best: bool = False,
 ) -> pathlib.Path:
     """Draw a film strip: one row per run, with evenly spaced frames of one episode, from its first to its last step.
 
@@ -212,6 +215,7 @@ def film(
         steps: stop the episodes after this many steps; None: play until the task ends them.
         task: needed only if the runs were trained on a task of your own.
         agent: needed only if the run was trained by an agent of your own: its class, or an instance.
+        best: take the seed's best agent, not its last one; see `evaluate`.
 
     Raises:
         UserError: there is no such run or seed, a number is impossible, or a task cannot be rendered.
@@ -226,17 +230,17 @@ def film(
     figures.paths(path)
     own = [agent if is_own(run.config["agent"]) else None for run in runs]
     rows = [
-        _strip(run, frames, seed, episode_seed, sampled, steps, task, made_by)
+        _strip(restore_seed(run, seed, task, made_by, best), frames, episode_seed, sampled, steps)
         for run, made_by in zip(runs, own, strict=True)
     ]
     return figures.save(_draw_strips(runs, rows), path)
 
 
 def _strip(
-    run: Run, frames: int, seed: int | None, episode_seed: int, sampled: bool, steps: int | None, task: Any, agent: Any
+    restored: tuple[Agent, Any, Any, str], frames: int, episode_seed: int, sampled: bool, steps: int | None
 ) -> Trajectory:
     """An episode with evenly spaced frames. It is played twice, since the first time gives its length."""
-    with Player(*restore_seed(run, seed, task, agent), rendered=True) as player:
+    with Player(*restored, rendered=True) as player:
         length = len(player.play(episode_seed, sampled, steps).steps.reward) - 1
         at = {round(time) for time in np.linspace(0, length, frames)}
         return player.play(episode_seed, sampled, steps, at)

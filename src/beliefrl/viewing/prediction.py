@@ -83,6 +83,7 @@ def predictions(
     sampled: bool = False,
     task: Task | GymnasiumTask | None = None,
     agent: Agent | type | None = None,
+    best: bool = False,
 ) -> Predictions:
     """Play an episode with the trained agent of a run, and predict it with the agent's model.
 
@@ -97,6 +98,7 @@ def predictions(
         sampled: sample the actions, instead of taking the policy's mode.
         task: needed only if the run was trained on a task of your own.
         agent: needed only if the run was trained by an agent of your own: its class, or an instance.
+        best: take the seed's best agent, not its last one; see `evaluate`.
 
     Raises:
         UserError: the agent has no such model, or no model, or a number is out of range.
@@ -104,7 +106,7 @@ def predictions(
     check_episode(episode_seed)
     _check_sizes(start, horizon, samples)
     run = run if isinstance(run, Run) else Run(run)
-    trained, found, state, precision = restore_seed(run, seed, task, agent)
+    trained, found, state, precision = restore_seed(run, seed, task, agent, best)
     name = _model(run, trained, model)
     with Player(trained, found, state, precision) as player:
         steps = player.play(episode_seed, sampled, (START if start is None else start) + horizon - 1).steps

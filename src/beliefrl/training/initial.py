@@ -1,0 +1,92 @@
+"""The networks that a training starts with, if they come from another run (the option init_from).
+
+They are copied to initial.safetensors in the new run's folder, so the other run is not needed again. Networks and
+running statistics are copied. Optimisers, replay, memories and step counts start anew.
+"""
+
+import pathlib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from beliefrl.agents import Agent
+from beliefrl.runs import arrays, best
+from beliefrl.runs.options import Options
+from beliefrl.runs.run import Run
+from beliefrl.types import Spec, UserError
+
+FILE = "initial.safetensors"
+
+
+def taken(options: Options, agent: Agent, spec: Spec) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The initial networks of all seeds by their names, and where they come from, for config.json.
+
+    Seed n starts from seed n of the other run. If that has fewer seeds, they are taken in turn.
+
+    Raises:
+        UserError: there is no such run, it has no trained agent, or the agents differ in an array.
+    """
+    source = Run(options.init_from or "")
+    path = source.agents(options.init_best)
+    saved = _fitting(source, arrays.load(path), agent, spec)
+    first, count = source.seeds[0], len(source.seeds)
+    seeds = range(options.seed, options.seed + options.seeds)
+    index = [(seed - first) % count for seed in seeds]
+    ends = best.evaluations(source.folder, count) if options.init_best else _last_evaluations(source)
+    session = [source.config, *source.config.get("resumed", ())][-1]
+    origin = {
+        "run": str(source.folder),
+        "agent": source.config["agent"],
+        "task": source.config["task"],
+        "git_commit": session.get("git_commit"),
+        "best": options.init_best,
+        "seeds": {seed: {"seed": source.seeds[at], **(ends[at] or {})} for seed, at in zip(seeds, index, strict=True)},
+    }
+    return {name: array[index] for name, array in saved.items()}, origin
+
+
+def write(folder: pathlib.Path, networks: dict[str, np.ndarray]) -> None:
+    """Write the initial networks to a run's folder."""
+    arrays.write_whole(folder / FILE, arrays.packed(networks))
+
+
+def started(folder: pathlib.Path, agent: Agent, states: Any) -> Any:
+    """The first states of a training, leaves (seed, ...), with the initial networks in a run's folder.
+
+    Raises:
+        UserError: the file is damaged, or does not fit the agent.
+    """
+    networks = arrays.read(folder / FILE, agent.networks(states))
+    named = {jax.tree_util.keystr(where): leaf for where, leaf in jax.tree_util.tree_leaves_with_path(networks)}
+    return jax.tree_util.tree_map_with_path(
+        lambda where, leaf: jnp.asarray(named.get(jax.tree_util.keystr(where), leaf)), states
+    )
+
+
+def _last_evaluations(source: Run) -> list[dict[str, Any] | None]:
+    """{"step"} of the last evaluation of each seed."""
+    steps = [max((row["step"] for row in source.rows(seed, "evaluation")), default=None) for seed in source.seeds]
+    return [None if step is None else {"step": step} for step in steps]
+
+
+def _fitting(source: Run, saved: dict[str, np.ndarray], agent: Agent, spec: Spec) -> dict[str, np.ndarray]:
+    """The networks among the arrays of a saved agent.
+
+    Raises:
+        UserError: they do not fit `agent` on its task; it names the first array that differs.
+    """
+    state = jax.eval_shape(lambda key: agent.init(key, spec), jax.random.key(0))
+    wanted, known = arrays.shapes(agent.networks(state)), arrays.shapes(state)
+    for name in wanted.keys() - known.keys():
+        raise UserError(f"init_from is impossible: networks() of this agent adds {name.lstrip('.')} to its state.")
+    for name in [*wanted, *(name for name in saved if name not in known)]:
+        there = f"the shape {saved[name].shape[1:]}" if name in saved else "no such array"
+        here = f"the shape {wanted[name].shape}" if name in wanted else "no such array"
+        if there != here:
+            raise UserError(
+                f"{source.folder} ({source.config['agent']} on {source.config['task']}) cannot be init_from: its "
+                f"{name.lstrip('.')} has {there}, this training's has {here}; the agent and all sizes must be the same."
+            )
+    return {name: saved[name] for name in wanted}
