@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from beliefrl.sweeps.run import SweepStatus, sweep
     from beliefrl.tasks import Task, observe
     from beliefrl.tasks import make as make_task
+    from beliefrl.tasks.check import TaskCheck, check
     from beliefrl.tasks.environment import TaskEnvironment
     from beliefrl.tasks.gymnasium import GymnasiumTask
     from beliefrl.training.evaluation import evaluate, task_of
@@ -52,12 +53,14 @@ __all__ = [
     "StoredTimestep",
     "SweepStatus",
     "Task",
+    "TaskCheck",
     "TaskEnvironment",
     "Timestep",
     "Trajectory",
     "UserError",
     "Window",
     "WindowShape",
+    "check",
     "draw_curve",
     "draw_predictions",
     "evaluate",
@@ -92,12 +95,14 @@ _HOMES = {
     "StoredTimestep": "types:StoredTimestep",
     "SweepStatus": "sweeps.run:SweepStatus",
     "Task": "tasks:Task",
+    "TaskCheck": "tasks.check:TaskCheck",
     "TaskEnvironment": "tasks.environment:TaskEnvironment",
     "Timestep": "types:Timestep",
     "Trajectory": "viewing.episodes:Trajectory",
     "UserError": "types:UserError",
     "Window": "types:Window",
     "WindowShape": "types:WindowShape",
+    "check": "tasks.check:check",
     "draw_curve": "analysis.curves:draw_curve",
     "draw_predictions": "viewing.prediction:draw_predictions",
     "evaluate": "training.evaluation:evaluate",

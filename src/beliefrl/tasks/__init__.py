@@ -168,7 +168,7 @@ def make(name: str, /, observe: Sequence[int | str] | int | str | None = None, *
         UserError: there is no such task or constant, a value is impossible, or `observe` does not fit the task.
     """
     task = _make(name, constants)
-    return task if observe is None else _observed(task, _indices(name, task, observe))
+    return task if observe is None else observed(name, task, observe)
 
 
 def _make(name: str, constants: dict[str, Any]) -> Any:
@@ -218,8 +218,9 @@ def _similar(name: str) -> str | None:
     return near[0] if near and name not in registered.ids() else registered.similar(name)
 
 
-def _observed(task: Any, indices: tuple[int, ...]) -> Any:
-    return observe(task, indices)  # in `make`, `observe` is an argument
+def observed(name: str, task: Any, entries: Sequence[int | str] | int | str) -> Any:
+    """The task `name` with only these entries of its observation; they are given as `observe` of `make`."""
+    return observe(task, _indices(name, task, entries))
 
 
 def _indices(name: str, task: Any, observe: Sequence[int | str] | int | str) -> tuple[int, ...]:
