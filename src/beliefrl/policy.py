@@ -1,8 +1,8 @@
 """A trained policy for deployment: numpy in and out, batched, with an export that runs without this library.
 
     policy = beliefrl.load("runs/first")
-    action, state = policy.predict(obs)                                          # an episode starts
-    action, state = policy.predict(obs, reward, state, episode_start=False)      # and continues
+    action, state = policy.predict(obs)                    # an episode starts
+    action, state = policy.predict(obs, reward, state)     # and continues
 
 The interface follows Stable-Baselines3's recurrent policies, with the reward as an additional input: beliefs depend on
 the rewards.
@@ -89,12 +89,10 @@ class Policy:
             is_first=episode_start,
             terminated=jnp.zeros_like(episode_start),
         )
-
-        def act(memory, step, key):
-            return self.agent.act(agent_state, memory, step, key, explore)
-
+        act = functools.partial(self.agent.act, agent_state)
+        axes = 0, 0, 0 if keys.ndim else None, None
         with jax.default_matmul_precision(self.precision):
-            action, memory = jax.vmap(act, in_axes=(0, 0, 0 if keys.ndim else None))(memory, step, keys)
+            action, memory = jax.vmap(act, in_axes=axes)(memory, step, keys, explore)
         return action, (*jax.tree.leaves(memory), action)
 
     def initial_state(self, batch: int) -> State:
@@ -197,8 +195,8 @@ class Policy:
         if path.exists() and not overwrite:
             raise UserError(f"{path} exists already: choose another file, or replace it with overwrite (--overwrite).")
         if path.suffix.lower() == ".onnx":
-            exact = Policy(self.agent, self.spec, self._state, task=self.task)  # in float32
-            content, difference = onnx.export(exact, self.environment)
+            in_float32 = Policy(self.agent, self.spec, self._state, task=self.task)
+            content, difference = onnx.export(in_float32, self.environment)
         else:
             content, difference = self._for_jax(), None
         try:
@@ -208,8 +206,7 @@ class Policy:
         return difference
 
     def _for_jax(self) -> bytes:
-        (batch,) = jax.export.symbolic_shape("batch")
-        shaped = jax.ShapeDtypeStruct
+        (batch,), shaped = jax.export.symbolic_shape("batch"), jax.ShapeDtypeStruct
         state = tuple(shaped((batch, *leaf.shape[1:]), leaf.dtype) for leaf in self.initial_state(1))
         numbers = shaped((batch, self.spec.obs_dim), jnp.float32), shaped((batch,), jnp.float32)
         rest = shaped((batch,), jnp.bool_), shaped((), jnp.uint32), shaped((), jnp.bool_)

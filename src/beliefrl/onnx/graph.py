@@ -131,9 +131,8 @@ class _Graph:
         values: dict[Any, Value] = {}
 
         def read(variable: Any) -> Value:
-            if hasattr(variable, "val"):  # a literal
-                return lambda: np.asarray(variable.val, variable.aval.dtype)
-            return values[variable]
+            literal = hasattr(variable, "val")
+            return (lambda: np.asarray(variable.val, variable.aval.dtype)) if literal else values[variable]
 
         values.update(
             zip(jaxpr.constvars, (functools.partial(jax.numpy.asarray, each) for each in constants), strict=True)
@@ -163,8 +162,8 @@ class _Graph:
         if not hasattr(self, f"do_{name}"):
             raise UserError(f"This agent cannot be exported to ONNX (it uses {name}): export it as a .jax file.")
         avals = [variable.aval for variable in equation.invars]
-        result = getattr(self, f"do_{name}")(inputs, avals, equation.outvars[0].aval, parameters)
-        return result if isinstance(result, list) else [result]
+        made = getattr(self, f"do_{name}")(inputs, avals, equation.outvars[0].aval, parameters)
+        return made if isinstance(made, list) else [made]
 
     def scan(self, parameters: dict[str, Any], inputs: list[Value]) -> list[Value]:
         """All steps of a scan, one after the other."""
@@ -256,8 +255,8 @@ class _Graph:
         return self.node("Split", inputs[0], _integers(*sizes), outputs=len(sizes), axis=int(parameters["axis"]))
 
     def do_stack(self, inputs, avals, out, parameters):
-        axis = int(parameters["axis"])
-        return self.node("Concat", *(self.node("Unsqueeze", each, _integers(axis)) for each in inputs), axis=axis)
+        rows = (self.node("Unsqueeze", each, _integers(parameters["axis"])) for each in inputs)
+        return self.node("Concat", *rows, axis=int(parameters["axis"]))
 
     def do_dot_general(self, inputs, avals, out, parameters):
         """The product as a product of matrices: the other axes of each factor become one."""
