@@ -42,7 +42,7 @@ def main(run: tyro.conf.Positional[str] = "runs/pendulum", episodes: int = 3, qu
     print("returns in your own loop:", totals)
 
     file = pathlib.Path(run) / "policy.jax"
-    policy.export(file)
+    policy.export(file, overwrite=True)  # "policy.onnx" gives a file for onnxruntime
     exported = jax.export.deserialize(bytearray(file.read_bytes()))  # does not need this library
     obs, _ = environment.reset(seed=0)
     state = policy.initial_state(1)  # zeros

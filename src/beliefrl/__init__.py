@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from beliefrl.sweeps.run import SweepStatus, sweep
     from beliefrl.tasks import Task, observe, with_faults
     from beliefrl.tasks import make as make_task
+    from beliefrl.tasks.check import TaskCheck, check
     from beliefrl.tasks.environment import TaskEnvironment
     from beliefrl.tasks.faults import Faults
     from beliefrl.tasks.gymnasium import GymnasiumTask
@@ -54,12 +55,14 @@ __all__ = [
     "StoredTimestep",
     "SweepStatus",
     "Task",
+    "TaskCheck",
     "TaskEnvironment",
     "Timestep",
     "Trajectory",
     "UserError",
     "Window",
     "WindowShape",
+    "check",
     "draw_curve",
     "draw_predictions",
     "evaluate",
@@ -96,12 +99,14 @@ _HOMES = {
     "StoredTimestep": "types:StoredTimestep",
     "SweepStatus": "sweeps.run:SweepStatus",
     "Task": "tasks:Task",
+    "TaskCheck": "tasks.check:TaskCheck",
     "TaskEnvironment": "tasks.environment:TaskEnvironment",
     "Timestep": "types:Timestep",
     "Trajectory": "viewing.episodes:Trajectory",
     "UserError": "types:UserError",
     "Window": "types:Window",
     "WindowShape": "types:WindowShape",
+    "check": "tasks.check:check",
     "draw_curve": "analysis.curves:draw_curve",
     "draw_predictions": "viewing.prediction:draw_predictions",
     "evaluate": "training.evaluation:evaluate",

@@ -142,10 +142,13 @@ class Known(NamedTuple):
     velocities: tuple[int, ...]
     positions: tuple[int, ...]  # all other entries
     extra: str | None = None  # the extra of this package that it needs
+    names: tuple[str, ...] = ()  # of the entries, if the environment itself has none; a unit follows in brackets
 
 
-def _known(id: str, about: str, size: int, velocities: tuple[int, ...], extra: str | None = None) -> Known:
-    return Known(id, about, velocities, tuple(i for i in range(size) if i not in velocities), extra)
+def _known(
+    id: str, about: str, size: int, velocities: tuple[int, ...], extra: str | None = None, names: tuple[str, ...] = ()
+) -> Known:
+    return Known(id, about, velocities, tuple(i for i in range(size) if i not in velocities), extra, names)
 
 
 def _bullet(robot: str, joints: int, feet: int) -> Known:
@@ -155,8 +158,8 @@ def _bullet(robot: str, joints: int, feet: int) -> Known:
     return _known(id, about, 8 + 2 * joints + feet, velocities, "robots")
 
 
-def _mujoco(id: str, size: int, velocities: tuple[int, ...]) -> Known:
-    return _known(id, f"MuJoCo's {id.split('-')[0]}.", size, velocities, "mujoco")
+def _mujoco(id: str, size: int, velocities: tuple[int, ...], names: tuple[str, ...] = ()) -> Known:
+    return _known(id, f"MuJoCo's {id.split('-')[0]}.", size, velocities, "mujoco", names)
 
 
 ANY = "gym:ID or gym:PACKAGE:ID"
@@ -169,10 +172,25 @@ ROBOTS: dict[str, Known] = {
 }
 
 GYMNASIUMS: tuple[Known, ...] = (
-    _known("Pendulum-v1", "Gymnasium's pendulum.", 3, (2,)),
-    _known("MountainCarContinuous-v0", "A car too weak for its hill.", 2, (1,)),
+    _known("Pendulum-v1", "Gymnasium's pendulum.", 3, (2,), names=("cos θ", "sin θ", "θ̇ (rad/s)")),
+    _known("MountainCarContinuous-v0", "A car too weak for its hill.", 2, (1,), names=("position", "velocity")),
     _mujoco("InvertedPendulum-v5", 4, (2, 3)),
-    _mujoco("InvertedDoublePendulum-v5", 9, (5, 6, 7)),
+    _mujoco(
+        "InvertedDoublePendulum-v5",
+        9,
+        (5, 6, 7),
+        (
+            "x (m)",
+            "sin θ₁",
+            "sin θ₂",
+            "cos θ₁",
+            "cos θ₂",
+            "ẋ (m/s)",
+            "θ̇₁ (rad/s)",
+            "θ̇₂ (rad/s)",
+            "force at the end (N)",
+        ),
+    ),
     _mujoco("Swimmer-v5", 8, tuple(range(3, 8))),
     _mujoco("Hopper-v5", 11, tuple(range(5, 11))),
     _mujoco("HalfCheetah-v5", 17, tuple(range(8, 17))),

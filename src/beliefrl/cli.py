@@ -11,13 +11,14 @@ HELP = """usage: beliefrl COMMAND ...
 
 Reinforcement learning for agents that do not see the whole state.
 
+  beliefrl check TASK           what a task observes and wants, and what the training would refuse
   beliefrl train AGENT TASK     train, with a live view, into a run's folder
   beliefrl resume RUN           go on with a training that was stopped or killed, or train it longer
   beliefrl sweep --preset NAME  many trainings: agents x tasks x settings x seeds, on all cores or a Ray cluster
   beliefrl figure KIND RUNS     the paper's figures and tables from finished runs: curves, ablation, elbo, ...
   beliefrl show RUN             what a run was made with, how far it is, and what it is worth
   beliefrl evaluate RUN         play new episodes with what a run has learned
-  beliefrl export RUN FILE      write the learned policy as one file that jax loads without this library
+  beliefrl export RUN FILE      write the learned policy as one file, for jax or (.onnx) for onnxruntime
   beliefrl report RUNS          one page for the browser: curves, final returns, settings, time
   beliefrl predict RUN          draw what its model predicts of an episode, open loop and closed loop, beside the truth
   beliefrl video RUN FILE       film episodes, as mp4 or gif

@@ -1,8 +1,8 @@
 """A trained policy for deployment: numpy in and out, batched, with an export that runs without this library.
 
     policy = beliefrl.load("runs/first")
-    action, state = policy.predict(obs)                                          # an episode starts
-    action, state = policy.predict(obs, reward, state, episode_start=False)      # and continues
+    action, state = policy.predict(obs)                    # an episode starts
+    action, state = policy.predict(obs, reward, state)     # and continues
 
 The interface follows Stable-Baselines3's recurrent policies, with the reward as an additional input: beliefs depend on
 the rewards.
@@ -11,6 +11,7 @@ the rewards.
 import functools
 import os
 import pathlib
+from collections.abc import Callable
 from numbers import Integral, Real
 from typing import Any
 
@@ -19,12 +20,13 @@ import jax.export
 import jax.numpy as jnp
 import numpy as np
 
-from beliefrl import agents
+from beliefrl import agents, onnx
 from beliefrl.agents import Agent
 from beliefrl.analysis.figures import check_folder
 from beliefrl.runs.arrays import write_whole
 from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
+from beliefrl.tasks.environment import TaskEnvironment
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.evaluation import restore_seed
 from beliefrl.types import LARGEST, Spec, Timestep, UserError, short
@@ -35,13 +37,23 @@ State = tuple[np.ndarray, ...]
 class Policy:
     """A trained agent as a function from observations and rewards to actions."""
 
-    def __init__(self, agent: Agent, spec: Spec, state: Any, seed: int = 0, precision: str = "float32", task: str = ""):
+    def __init__(
+        self,
+        agent: Agent,
+        spec: Spec,
+        state: Any,
+        seed: int = 0,
+        precision: str = "float32",
+        task: str = "",
+        environment: Callable[[], Any] | None = None,
+    ):
         """Make a policy of an agent and one of its trained states.
 
-        `seed` is the random seed of sampled actions, `precision` that of matrix products (`Run.precision`), and `task`
-        a name for `repr`.
+        `seed` is the random seed of sampled actions, `precision` that of matrix products (`Run.precision`), `task` a
+        name for `repr`. `environment` makes an environment as the agent sees it, to check an ONNX export in.
         """
         self.agent, self.spec, self.seed, self.precision, self.task = agent, spec, seed, precision, task
+        self.environment = environment
         self._state = jax.device_put(state)
         self._empty = jax.device_get(agent.reset(spec))  # the memory at the start of an episode
         self._act = jax.jit(lambda *inputs: self._step(self._state, *inputs))
@@ -55,6 +67,18 @@ class Policy:
 
     def _step(self, agent_state, obs, reward, state, episode_start, seed, deterministic):
         """Act for a batch. `state` holds the leaves of the memory and the previous action, each (batch, ...)."""
+        key = jax.random.key(seed)
+        keys = jax.vmap(lambda index: jax.random.fold_in(key, index))(jnp.arange(obs.shape[0]))
+        return self._act_with(agent_state, obs, reward, state, episode_start, keys, ~deterministic)
+
+    def mode(self, obs: Any, reward: Any, episode_start: Any, *state: Any) -> tuple[Any, ...]:
+        """The mode action and the parts of the next state, as a pure JAX function of arrays (batch, ...)."""
+        key, explore = jax.random.key(0), jnp.array(False)
+        action, after = self._act_with(self._state, obs, reward, state, episode_start, key, explore)
+        return action, *after
+
+    def _act_with(self, agent_state, obs, reward, state, episode_start, keys, explore):
+        """The same with a random key for each episode, or one key for all of them."""
         *memory, prev_action = state
         memory = jax.tree.structure(self._empty).unflatten(memory)
         memory = jax.tree.map(functools.partial(_where_first, episode_start), self._empty, memory)
@@ -65,14 +89,10 @@ class Policy:
             is_first=episode_start,
             terminated=jnp.zeros_like(episode_start),
         )
-        key = jax.random.key(seed)
-        keys = jax.vmap(lambda index: jax.random.fold_in(key, index))(jnp.arange(obs.shape[0]))
-
-        def act(memory, step, key):
-            return self.agent.act(agent_state, memory, step, key, ~deterministic)
-
+        act = functools.partial(self.agent.act, agent_state)
+        axes = 0, 0, 0 if keys.ndim else None, None
         with jax.default_matmul_precision(self.precision):
-            action, memory = jax.vmap(act)(memory, step, keys)
+            action, memory = jax.vmap(act, in_axes=axes)(memory, step, keys, explore)
         return action, (*jax.tree.leaves(memory), action)
 
     def initial_state(self, batch: int) -> State:
@@ -150,8 +170,12 @@ class Policy:
                 raise UserError("state holds a number that is not finite: give the second result of `predict`.")
         return tuple(leaves)
 
-    def export(self, path: str | os.PathLike[str]) -> None:
-        """Write the policy to a file that jax loads without this library, for any batch size, for CPUs and NVIDIA GPUs.
+    def export(self, path: str | os.PathLike[str], overwrite: bool = False) -> float | None:
+        """Write the policy to one file that runs without this library, for any batch size.
+
+        The name of the file decides its format. A name that ends in .onnx gives an ONNX graph, which runs without JAX,
+        for example in onnxruntime, and takes the mode of the policy (`beliefrl.onnx`). It is compared with this policy
+        in an episode. Any other name gives a file for `jax.export`, for CPUs and NVIDIA GPUs:
 
             policy = jax.export.deserialize(pathlib.Path("policy.jax").read_bytes())
             action, state = policy.call(obs, reward, state, episode_start, seed, deterministic)
@@ -160,24 +184,33 @@ class Policy:
         actions; and a bool. `policy.in_avals` has the shapes of the state. The first state may be zeros, since the
         state is ignored where episode_start is True. Loading needs the packages jax and flatbuffers.
 
+        `overwrite` replaces an existing file. Returns for ONNX the largest difference found, otherwise None.
+
         Raises:
-            UserError: the file cannot be written.
+            UserError: the file exists, or cannot be written. For ONNX also: the extra `onnx` is not installed, the
+                agent uses an operation that is not supported, or the difference is more than 1e-5.
         """
         path = pathlib.Path(path)
         check_folder(path)
-        (batch,) = jax.export.symbolic_shape("batch")
+        if path.exists() and not overwrite:
+            raise UserError(f"{path} exists already: choose another file, or replace it with overwrite (--overwrite).")
+        if path.suffix.lower() == ".onnx":
+            in_float32 = Policy(self.agent, self.spec, self._state, task=self.task)
+            content, difference = onnx.export(in_float32, self.environment)
+        else:
+            content, difference = self._for_jax(), None
+        try:
+            write_whole(path, content)
+        except OSError as error:
+            raise UserError(f"{path} cannot be written ({error.strerror}): choose another file.") from None
+        return difference
 
-        def shaped(shape: tuple[Any, ...], kind: Any) -> jax.ShapeDtypeStruct:
-            return jax.ShapeDtypeStruct(shape, kind)
-
+    def _for_jax(self) -> bytes:
+        (batch,), shaped = jax.export.symbolic_shape("batch"), jax.ShapeDtypeStruct
         state = tuple(shaped((batch, *leaf.shape[1:]), leaf.dtype) for leaf in self.initial_state(1))
         numbers = shaped((batch, self.spec.obs_dim), jnp.float32), shaped((batch,), jnp.float32)
         rest = shaped((batch,), jnp.bool_), shaped((), jnp.uint32), shaped((), jnp.bool_)
-        exported = jax.export.export(self._act, platforms=("cpu", "cuda"))(*numbers, state, *rest)
-        try:
-            write_whole(path, bytes(exported.serialize()))
-        except OSError as error:
-            raise UserError(f"{path} cannot be written ({error.strerror}): choose another file.") from None
+        return bytes(jax.export.export(self._act, platforms=("cpu", "cuda"))(*numbers, state, *rest).serialize())
 
 
 def load(
@@ -202,7 +235,8 @@ def load(
     run = run if isinstance(run, Run) else Run(run)
     trained, found, state, precision = restore_seed(run, seed, task, agent, best)
     seed = run.seeds[0] if seed is None else seed
-    return Policy(trained, found.spec, state, seed, precision, run.config["task"])
+    environment = found.environment if isinstance(found, GymnasiumTask) else lambda: TaskEnvironment(found)
+    return Policy(trained, found.spec, state, seed, precision, run.config["task"], environment)
 
 
 def _numbers(value: Any, name: str) -> np.ndarray:

@@ -4,6 +4,7 @@ import importlib
 from collections.abc import Callable, Sequence
 
 COMMANDS: dict[str, str] = {  # module:function, imported when it is called
+    "check": "training:check",
     "train": "training:train",
     "resume": "training:resume",
     "sweep": "sweep:sweep",

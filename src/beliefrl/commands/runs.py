@@ -29,15 +29,17 @@ class EvaluateOptions:
 
 @dataclasses.dataclass(frozen=True)
 class ExportOptions:
-    """Write a run's policy to one file that jax loads without this library (`beliefrl.Policy.export`)."""
+    """Write a run's policy to one file that runs without this library (`beliefrl.Policy.export`)."""
 
     run: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
     file: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="FILE")]
-    """The file to write. An existing file is replaced."""
+    """The file to write. NAME.onnx is an ONNX model (needs the extra `onnx`); any other name is for jax.export."""
     seed: int | None = None
     """One of the run's seeds. None: its first."""
     best: Best = False
+    overwrite: bool = False
+    """Replace an existing file."""
     agent: OwnAgent = None
 
 
@@ -95,5 +97,10 @@ def export(argv: Sequence[str]) -> None:
     options = parse(ExportOptions, argv, "beliefrl export")
     from beliefrl.policy import load
 
-    load(options.run, options.seed, agent=own_agent(options.agent), best=options.best).export(options.file)
-    print(f"written to {options.file}: jax.export.deserialize reads it")
+    policy = load(options.run, options.seed, agent=own_agent(options.agent), best=options.best)
+    difference = policy.export(options.file, options.overwrite)
+    if difference is None:
+        print(f"written to {options.file}: jax.export.deserialize reads it")
+    else:
+        print(f"written to {options.file}: onnxruntime reads it")
+        print(f"largest difference from the policy in an episode: {difference:.1g}")

@@ -1,4 +1,4 @@
-"""`beliefrl train` and `beliefrl resume`."""
+"""`beliefrl check`, `beliefrl train` and `beliefrl resume`."""
 
 import dataclasses
 import pathlib
@@ -11,6 +11,35 @@ from beliefrl import catalogue
 from beliefrl.commands.arguments import OwnAgent, agent_name, agent_options, named_values, own_agent, parse
 
 NewLimit = Annotated[float | Literal["same"] | None, tyro.conf.arg(metavar="FLOAT|None|same")]
+TaskName = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK", help="`beliefrl tasks` lists them.")]
+Observe = Annotated[
+    tuple[str, ...],
+    tyro.conf.arg(
+        metavar="ENTRIES",
+        help="Entries of the observation that the agent sees: indices, or `velocities` or `positions` if the task "
+        "defines them. None: all.",
+    ),
+]
+Constants = Annotated[
+    tuple[str, ...],
+    tyro.conf.arg(
+        metavar="NAME=VALUE",
+        help="Constants of a task's physics, or arguments of a Gymnasium environment, such as max_episode_steps=500.",
+    ),
+]
+
+
+@dataclasses.dataclass(frozen=True)
+class CheckOptions:
+    """Show what a task observes and wants, and what the training would refuse. Takes random steps in it."""
+
+    task: TaskName
+    observe: Observe = ()
+    constants: Constants = ()
+    steps: int = 200
+    """Number of random steps."""
+    seed: int = 0
+    """Random seed of the steps."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,6 +57,21 @@ class ResumeOptions:
     agent: OwnAgent = None
 
 
+def check(argv: Sequence[str]) -> None:
+    """`beliefrl check TASK ...`."""
+    options = parse(CheckOptions, argv, "beliefrl check")
+    from rich.console import Console
+
+    from beliefrl.errors import UserError
+    from beliefrl.tasks.check import check as look
+
+    constants = named_values(options.constants, "--constants")
+    found = look(options.task, options.observe or None, options.steps, options.seed, **constants)
+    Console().print(found)
+    if found.refusals:
+        raise UserError(" ".join(found.refusals))
+
+
 def train(argv: Sequence[str]) -> None:
     """`beliefrl train AGENT TASK ...`."""
     name, rest = agent_name(argv, "train", "TASK")
@@ -40,34 +84,9 @@ def train(argv: Sequence[str]) -> None:
     options_type = agent_options(
         agents.find(name),
         {
-            "task": (
-                Annotated[
-                    tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK", help="`beliefrl tasks` lists them.")
-                ],
-                dataclasses.MISSING,
-            ),
-            "observe": (
-                Annotated[
-                    tuple[str, ...],
-                    tyro.conf.arg(
-                        metavar="ENTRIES",
-                        help="Entries of the observation that the agent sees: indices, or `velocities` or `positions` "
-                        "if the task defines them. None: all.",
-                    ),
-                ],
-                (),
-            ),
-            "constants": (
-                Annotated[
-                    tuple[str, ...],
-                    tyro.conf.arg(
-                        metavar="NAME=VALUE",
-                        help="Constants of a task's physics, or arguments of a Gymnasium environment, such as "
-                        "max_episode_steps=500.",
-                    ),
-                ],
-                (),
-            ),
+            "task": (TaskName, dataclasses.MISSING),
+            "observe": (Observe, ()),
+            "constants": (Constants, ()),
             "faults": (
                 Annotated[Faults, tyro.conf.OmitArgPrefixes, tyro.conf.arg(help="Missing and faulty sensors.")],
                 Faults(),

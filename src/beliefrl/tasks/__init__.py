@@ -196,7 +196,7 @@ def make(
             fit the task.
     """
     task = _make(name, constants)
-    task = task if observe is None else _observed(task, _indices(name, task, observe))
+    task = task if observe is None else observed(name, task, observe)
     return with_faults(task, Faults.of(faults))
 
 
@@ -247,8 +247,9 @@ def _similar(name: str) -> str | None:
     return near[0] if near and name not in registered.ids() else registered.similar(name)
 
 
-def _observed(task: Any, indices: tuple[int, ...]) -> Any:
-    return observe(task, indices)  # in `make`, `observe` is an argument
+def observed(name: str, task: Any, entries: Sequence[int | str] | int | str) -> Any:
+    """The task `name` with only these entries of its observation; they are given as `observe` of `make`."""
+    return observe(task, _indices(name, task, entries))
 
 
 def _indices(name: str, task: Any, observe: Sequence[int | str] | int | str) -> tuple[int, ...]:

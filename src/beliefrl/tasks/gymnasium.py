@@ -14,6 +14,7 @@ import numpy as np
 from gymnasium import spaces
 
 from beliefrl.tasks.faults import NONE, STREAM, Draws, Faults
+from beliefrl.tasks.labels import observation_names
 from beliefrl.tasks.spaces import check_actions, flat_bounds, flat_size, limits
 from beliefrl.types import LARGEST, Spec, UserError, check_indices, check_range, said, short
 
@@ -67,6 +68,18 @@ class GymnasiumTask:
         size = self.faults.observed_size(environment.indices.size)
         return Spec(size, actions.low.size, environment.limit or LARGEST, self.has_success)
 
+    @cached_property
+    def entry_names(self) -> tuple[str, ...]:
+        """The name of each entry that the agent sees, if the environment offers names; "entry 2" if not.
+
+        Raises:
+            UserError: the environment cannot be made, or its spaces are not supported.
+        """
+        environment = self.environment()
+        names = observation_names(environment.inner, environment.inner_observation_space, self.name)
+        environment.close()
+        return tuple(names[index] for index in environment.indices)
+
     def environment(self, seed: str = "") -> "Environment":
         """Make one environment, as the agent sees it. `seed` identifies it in the messages of faults.
 
@@ -75,6 +88,19 @@ class GymnasiumTask:
                 observation.
         """
         return Environment(self, seed) if self.faults == NONE else FaultyEnvironment(self, seed)
+
+    def bare(self) -> Any:
+        """Make one environment as it is, without any checks. It may be anything.
+
+        Raises:
+            UserError: the environment cannot be made.
+        """
+        try:
+            return self.make(**self.arguments)
+        except UserError:
+            raise
+        except Exception as error:  # an environment may raise anything
+            raise UserError(f"{self.name} cannot be made: {said(error)}.") from None
 
 
 class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -87,12 +113,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         """Make the environment and check its spaces."""
         self.task, self.seed = task, seed
         self.steps, self.length = 0, 0  # in total, and in this episode
-        try:
-            self.inner = task.make(**task.arguments)
-        except UserError:
-            raise
-        except Exception as error:  # an environment may raise anything
-            raise UserError(f"{task.name} cannot be made: {said(error)}.") from None
+        self.inner = task.bare()
         self.inner_action_space: Any = getattr(self.inner, "action_space", None)
         self.inner_observation_space: Any = getattr(self.inner, "observation_space", None)
         check_actions(self.inner_action_space, task.name)
@@ -100,6 +121,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         if task.indices is not None:
             check_indices(task.indices, self._size)
         self.indices = np.arange(self._size) if task.indices is None else np.array(task.indices)
+        self.whole = np.full(self._size, np.nan)  # the newest observation with all of its entries, as it came
         self._lowest, self._highest = limits(self.inner_observation_space, self.indices)
         self.observation_space = spaces.Box(-np.inf, np.inf, (self.indices.size,), np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (self.inner_action_space.low.size,), np.float32)
@@ -184,8 +206,9 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
                 raise self._fault(f"the observation does not fit its space {short(space)}") from None
             if value.shape != (self._size,):
                 raise self._fault(f"the observation does not fit its space {short(space)}")
+        self.whole = value.reshape(-1)
         with np.errstate(over="ignore"):
-            flat = value.reshape(-1)[self.indices].astype(np.float32)
+            flat = self.whole[self.indices].astype(np.float32)
         if not np.isfinite(flat).all():
             entry = int(self.indices[~np.isfinite(flat)][0])
             raise self._fault(f"entry {entry} of the observation is {value.reshape(-1)[entry]}")

@@ -42,7 +42,8 @@ def flat_size(space: Any, name: str) -> int:
     Raises:
         UserError: the space contains images, text, or anything else that does not flatten to a fixed number of entries.
     """
-    for where, leaf in _leaves(space):
+    for path, leaf in leaves(space):
+        where = f" at {''.join(f'[{key!r}]' for key in path)}" if path else ""
         if isinstance(leaf, spaces.Box) and _is_image(leaf):
             raise UserError(
                 f"{name} observes images ({short(leaf)}{where}): only vectors of numbers are supported, such as a "
@@ -63,14 +64,14 @@ def flat_size(space: Any, name: str) -> int:
     return size
 
 
-def _leaves(space: Any, where: str = "") -> Iterator[tuple[str, Any]]:
-    """The elementary spaces in a space, each with its position as text, such as " at ['arm'][0]"."""
+def leaves(space: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], Any]]:
+    """The elementary spaces in a space, in the order of the flat observation, each with its keys: ("arm", 0)."""
     if isinstance(space, spaces.Dict | spaces.Tuple):
         parts = space.items() if isinstance(space, spaces.Dict) else enumerate(space)
-        for name, part in parts:
-            yield from _leaves(part, f"{where or ' at '}[{name!r}]")
+        for key, part in parts:
+            yield from leaves(part, (*path, key))
     else:
-        yield where, space
+        yield path, space
 
 
 def _is_image(space: spaces.Box) -> bool:

@@ -1,0 +1,96 @@
+"""A trained policy as an ONNX model, which runs without JAX: any batch size, mode actions, the state as inputs.
+
+    session = onnxruntime.InferenceSession("policy.onnx")
+
+Inputs are obs (batch, obs), reward and episode_start (batch,), as in `Policy.predict`, and state_0, state_1, ...: the
+state, whose last part is the previous action. Outputs are action (batch, action), and next_state_0, next_state_1, ....
+The first state may be zeros, since the state is ignored where episode_start is True.
+
+The packages onnx and onnxruntime are an extra of this library, imported when they are needed.
+"""
+
+import importlib
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from beliefrl.onnx.graph import model
+from beliefrl.types import UserError
+
+LARGEST_DIFFERENCE = 1e-5  # between a policy and its model
+CHECKED_STEPS = 200
+
+
+def export(policy: Any, environment: Callable[[], Any] | None = None) -> tuple[bytes, float]:
+    """The ONNX model of a `Policy`, and the largest difference found between the two.
+
+    They are compared in onnxruntime at every timestep of an episode of at most 200 steps: each action, and each number
+    of the next state, relative to its size if that is more than 1. The episode is played in an environment that
+    `environment` makes. If it is None, observations and rewards are made up.
+
+    Raises:
+        UserError: a package is missing, the agent uses a primitive that is not supported, or the difference is more
+            than 1e-5.
+    """
+    try:
+        onnx, runtime = (importlib.import_module(name) for name in ("onnx", "onnxruntime"))
+    except ImportError:
+        raise UserError("ONNX needs packages that are not installed: pip install 'beliefrl[onnx]'.") from None
+    parts = {f"state_{index}": part for index, part in enumerate(policy.initial_state(1))}
+    inputs: dict[str, tuple[tuple[int, ...], Any]] = {
+        "obs": ((policy.spec.obs_dim,), np.float32),
+        "reward": ((), np.float32),
+        "episode_start": ((), np.bool_),
+        **{name: (part.shape[1:], part.dtype) for name, part in parts.items()},
+    }
+    outputs = ["action", *(f"next_{name}" for name in parts)]
+    content = model(onnx, policy.mode, inputs, outputs, {"policy": repr(policy)})
+    difference = _difference(policy, runtime, content, environment() if environment else _MadeUp(policy.spec.obs_dim))
+    if not difference <= LARGEST_DIFFERENCE:
+        raise UserError(
+            f"The ONNX model differs from the policy by {difference:.1g}, more than {LARGEST_DIFFERENCE:.0e}: export "
+            "the policy as a .jax file."
+        )
+    return content, difference
+
+
+def _difference(policy: Any, runtime: Any, content: bytes, environment: Any) -> float:
+    """The largest difference between a policy and its model along an episode."""
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    session = runtime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    names = [each.name for each in session.get_inputs()]
+    obs, _ = environment.reset(seed=0)
+    reward, state, largest = 0.0, policy.initial_state(1), 0.0
+    for time in range(CHECKED_STEPS):
+        start = np.array([time == 0])
+        given = {"obs": np.asarray(obs, np.float32)[None], "reward": np.array([reward], np.float32)}
+        given |= {"episode_start": start, **{f"state_{index}": part for index, part in enumerate(state)}}
+        outputs = session.run(None, {name: given[name] for name in names})
+        action, state = policy.predict(obs, reward, state, start[0])
+        for ours, theirs in zip((action[None], *state), outputs, strict=True):
+            error = np.abs(theirs.astype(np.float64) - ours) / np.maximum(1.0, np.abs(ours))
+            largest = max(largest, float(np.max(error, initial=0.0)))
+        obs, reward, terminated, truncated, _ = environment.step(action)
+        if terminated or truncated:
+            break
+    environment.close()
+    return largest
+
+
+class _MadeUp(gymnasium.Env[np.ndarray, np.ndarray]):
+    """Observations and rewards from the standard normal distribution."""
+
+    def __init__(self, obs: int):
+        self.size = obs
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        return self.np_random.normal(size=self.size), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        return self.np_random.normal(size=self.size), float(self.np_random.normal()), False, False, {}

@@ -1,0 +1,299 @@
+"""Look at a task before training: what it shows and wants, what the training will refuse, and what is suspicious."""
+
+import dataclasses
+import io
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from rich.console import Console, Group
+from rich.table import Table
+from rich.text import Text
+
+from beliefrl import tasks
+from beliefrl.tasks import Observed
+from beliefrl.tasks.environment import TaskEnvironment
+from beliefrl.tasks.gymnasium import ENDLESS, GymnasiumTask
+from beliefrl.tasks.labels import action_names, observation_names
+from beliefrl.tasks.spaces import check_actions, flat_bounds, flat_size
+from beliefrl.types import LARGEST, UserError, short
+
+SCALES = 100.0  # entries whose largest magnitudes differ by more than this factor cause a warning
+MOST_ROWS = 100  # of a printed table
+MOST_NAMED = 5  # entries in one warning
+
+
+@dataclasses.dataclass(frozen=True)
+class Entry:
+    """One entry of an observation or of an action."""
+
+    index: int
+    name: str
+    """Name with a unit in brackets; "entry 2" or "" if the environment has none."""
+    low: float
+    high: float
+    """Declared range; infinite if none is declared."""
+    seen_low: float = np.nan
+    seen_high: float = np.nan
+    """Range in the random steps; NaN for actions."""
+    position: int | None = None
+    """Index in what the agent observes; None if the agent does not observe it."""
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class TaskCheck:
+    """What `check` found; prints as tables."""
+
+    task: str
+    observation_space: str
+    action_space: str
+    entries: tuple[Entry, ...] = ()
+    """All entries of the full observation."""
+    actions: tuple[Entry, ...] = ()
+    max_steps: int | None = None
+    """Time limit in steps; None if there is none."""
+    rewards: tuple[float, float] | None = None
+    """Lowest and highest reward in the random steps."""
+    steps: int = 0
+    """Random steps that were taken."""
+    episodes: int = 0
+    """Episodes that ended in these steps."""
+    steps_per_second: float = 0.0
+    warnings: tuple[str, ...] = ()
+    """Sentences about what is suspicious; the training does not refuse it."""
+    refusals: tuple[str, ...] = ()
+    """Sentences about what the training refuses; empty if the task can be trained on."""
+
+    def __repr__(self) -> str:
+        """The tables and sentences as plain text."""
+        page = io.StringIO()
+        refused = [Text(f"refused: {sentence}") for sentence in self.refusals]
+        Console(file=page, width=100, color_system=None).print(self, *refused, sep="\n")
+        return "\n".join(line.rstrip() for line in page.getvalue().splitlines())
+
+    def __rich__(self) -> Group:
+        """Everything but the refusals, in colour on a terminal."""
+        parts = [self._summary()]
+        if self.entries:
+            parts += [_table("observation", self.entries, seen=True), _table("action", self.actions, seen=False)]
+        return Group(*parts, *(Text(f"warning: {sentence}", "yellow") for sentence in self.warnings))
+
+    def _summary(self) -> Table:
+        table = Table(title=Text(self.task), title_justify="left", show_header=False)
+        rows = {"observation": self.observation_space, "action": self.action_space}
+        if self.entries:
+            seen = sum(entry.position is not None for entry in self.entries)
+            rows["agent observes"] = f"{seen} of {len(self.entries)} entries"
+            limit = "no time limit" if self.max_steps is None else f"at most {self.max_steps:,} steps"
+            rows["episode"] = f"{limit}; {self.episodes} ended in {self.steps} random steps"
+        if self.rewards:
+            rows["reward"] = f"{_range(*self.rewards)} in these steps"
+            rows["speed"] = f"{float(f'{self.steps_per_second:.2g}'):,.0f} steps a second, one environment alone"
+        for name, value in rows.items():
+            table.add_row(name, Text(value))
+        return table
+
+
+def check(
+    task: Any, observe: Sequence[int | str] | int | str | None = None, steps: int = 200, seed: int = 0, **constants: Any
+) -> TaskCheck:
+    """Take random steps in a task, and report what it shows and wants, what training refuses, and what is suspicious.
+
+        print(beliefrl.check("gym:Pendulum-v1", observe=[0, 1]))
+
+    Actions are uniform between the bounds of the environment.
+
+    Args:
+        task: the name of a task, as for `make_task`, or a task.
+        observe: entries that the agent shall observe, as for `make_task`; None: all, or those of the task.
+        steps: number of random steps, at least 1.
+        seed: random seed of the steps, at least 0.
+        constants: as for `make_task`, if `task` is a name.
+
+    Raises:
+        UserError: there is no such task or constant, the environment cannot be made, or a number is out of range.
+    """
+    for what, value, least in (("steps", steps, 1), ("seed", seed, 0)):
+        if not least <= value <= LARGEST // 2:
+            raise UserError(f"{what}={value} is impossible: it must be a whole number of at least {least}.")
+    name = task if isinstance(task, str) else ""
+    whole = tasks.make(task, **constants) if isinstance(task, str) else task
+    found = _declared(whole)
+    if found.refusals:
+        return found
+    seen = whole
+    try:
+        seen = whole if observe is None else tasks.observed(name, whole, observe)
+    except UserError as error:  # the tables are still made: they show which entries there are
+        found = dataclasses.replace(found, refusals=(str(error),))
+    return _played(found, seen, steps, seed)
+
+
+def _declared(task: Any) -> TaskCheck:
+    """What a task declares. If its spaces are not supported: the refusals, and no entries."""
+    if not isinstance(task, GymnasiumTask):
+        base, spec = _unmasked(task), task.spec
+        names = tasks.entry_names(base)
+        entries = tuple(Entry(index, name, -np.inf, np.inf) for index, name in enumerate(names))
+        actions = tuple(Entry(index, "", -1.0, 1.0) for index in range(spec.action_dim))
+        spaces = f"entries: {len(entries)}", f"entries: {spec.action_dim}, from -1 to 1"
+        return TaskCheck(tasks.describe(task)["task"], *spaces, entries, actions, spec.max_steps)
+    environment = task.bare()
+    space, actions = (getattr(environment, f"{what}_space", None) for what in ("observation", "action"))
+    found = TaskCheck(task.name, short(space), short(actions))
+    refusals = _refusals(lambda: check_actions(actions, task.name), lambda: flat_size(space, task.name))
+    if not refusals:
+        bounds, wanted = flat_bounds(space), flat_bounds(actions)
+        names = observation_names(environment, space, task.name), action_names(environment, wanted.low.size)
+        found = dataclasses.replace(found, entries=_entries(names[0], bounds), actions=_entries(names[1], wanted))
+    if hasattr(environment, "close"):
+        environment.close()
+    return dataclasses.replace(found, refusals=refusals)
+
+
+def _unmasked(task: Any) -> Any:
+    return _unmasked(task.task) if isinstance(task, Observed) else task
+
+
+def _entries(names: Sequence[str], bounds: Any) -> tuple[Entry, ...]:
+    rows = zip(names, bounds.low.tolist(), bounds.high.tolist(), strict=True)
+    return tuple(Entry(index, name, float(low), float(high)) for index, (name, low, high) in enumerate(rows))
+
+
+def _refusals(*checks: Callable[[], Any]) -> tuple[str, ...]:
+    """The sentences of those checks that fail."""
+    sentences = []
+    for each in checks:
+        try:
+            each()
+        except UserError as error:
+            sentences.append(str(error))
+    return tuple(sentences)
+
+
+def _played(found: TaskCheck, task: Any, steps: int, seed: int) -> TaskCheck:
+    """The same, with what random steps show; `task` has the entries that the agent observes."""
+    on_host = isinstance(task, GymnasiumTask)
+    refusals, observations, rewards, times, ends = list(found.refusals), [], [], [], []
+    environment: Any = task.environment() if on_host else TaskEnvironment(_unmasked(task))
+    limit = environment.limit if on_host else task.spec.max_steps
+    random, length = np.random.default_rng(seed), 0
+    try:
+        for _ in range(steps):
+            if length == 0:
+                obs, _ = environment.reset(seed=seed + len(ends))
+                observations.append(environment.whole if on_host else obs)
+            started = time.perf_counter()
+            obs, reward, *end, _ = environment.step(random.uniform(-1.0, 1.0, len(found.actions)))
+            times.append(time.perf_counter() - started)
+            observations.append(environment.whole if on_host else obs)
+            rewards.append(float(reward))
+            length = 0 if any(end) or length + 1 == limit else length + 1
+            ends += [] if length else [end]
+    except UserError as error:
+        refusals.append(str(error))
+    environment.close()
+    values = np.array(observations, np.float64).reshape(-1, len(found.entries))
+    seen = () if found.refusals else tasks.entries(task)
+    entries = _with_values(found.entries, values, seen)
+    found = dataclasses.replace(
+        found,
+        entries=entries,
+        max_steps=limit,
+        rewards=(min(rewards), max(rewards)) if rewards else None,
+        steps=len(rewards),
+        episodes=len(ends),
+        steps_per_second=1 / max(float(np.median(times)), 1e-9) if times else 0.0,
+        refusals=tuple(refusals),
+    )
+    truncates = any(truncated for _, truncated in ends)
+    warnings = *_about_observations(entries, values), *_about_episodes(found, rewards, truncates)
+    return dataclasses.replace(found, warnings=warnings)
+
+
+def _with_values(entries: Sequence[Entry], values: Any, seen: Sequence[int]) -> tuple[Entry, ...]:
+    """The entries with the range of their finite values (time, entry), and their positions in what the agent sees."""
+    positions = {index: position for position, index in enumerate(seen)}
+    rows = []
+    for entry, column in zip(entries, values.T, strict=True):
+        finite = column[np.isfinite(column)]
+        low, high = (float(finite.min()), float(finite.max())) if finite.size else (np.nan, np.nan)
+        position = positions.get(entry.index)
+        rows.append(dataclasses.replace(entry, seen_low=low, seen_high=high, position=position))
+    return tuple(rows)
+
+
+def _about_observations(entries: Sequence[Entry], values: Any) -> list[str]:
+    """Warnings about entries with the values (time, entry)."""
+    sentences = []
+    broken = [entry for entry in entries if not np.isfinite(values[:, entry.index]).all()]
+    if broken:
+        sentences.append(f"{_listed(broken)} had values that are not finite: an agent that observes them diverges.")
+    outside = [e for e in entries if _beyond(e.low - e.seen_low, e.low) or _beyond(e.seen_high - e.high, e.high)]
+    if outside:
+        sentences.append(f"{_listed(outside)} left the declared range: correct the observation or its space.")
+    seen = [entry for entry in entries if entry.position is not None]
+    constant = [entry for entry in seen if entry.seen_low == entry.seen_high]
+    if constant and len(values) > 1:
+        sentences.append(f"{_listed(constant)} never changed: leave out what says nothing, with --observe.")
+    sizes = sorted((max(-entry.seen_low, entry.seen_high), entry.index) for entry in seen if entry not in constant)
+    if sizes and sizes[-1][0] > SCALES * sizes[0][0]:
+        small, large = (f"{_listed([entries[i]])} up to {_number(size)}" for size, i in (sizes[0], sizes[-1]))
+        sentences.append(
+            f"Scales differ: {small}, {large}. Scale them in the environment, or use predictive-sac, which "
+            "standardises observations."
+        )
+    return sentences
+
+
+def _beyond(excess: float, bound: float) -> bool:
+    """Whether a value exceeds a bound by more than rounding."""
+    return excess > 1e-5 * max(1.0, abs(bound))
+
+
+def _about_episodes(found: TaskCheck, rewards: Sequence[float], truncates: bool) -> list[str]:
+    """Warnings about rewards and the end of episodes."""
+    sentences = []
+    if rewards and not any(rewards):
+        sentences.append("The reward was always 0: an agent that never meets another reward cannot learn.")
+    if found.max_steps is None and not truncates:
+        sentences.append(
+            f"There is no time limit: an episode of more than {ENDLESS:,} steps stops the training; set one with "
+            "--constants max_episode_steps=500."
+        )
+    return sentences
+
+
+def _listed(entries: Sequence[Entry]) -> str:
+    """Entries in a sentence: "Entry 2 (θ̇ in rad/s)"."""
+    names = [
+        str(entry.index) if entry.name == f"entry {entry.index}" else f"{entry.index}, {entry.name},"
+        for entry in entries[:MOST_NAMED]
+    ]
+    more = len(entries) - len(names)
+    text = " and ".join([*names, *([f"{more} more"] if more else [])])
+    return f"{'Entry' if len(entries) == 1 else 'Entries'} {text}"
+
+
+def _number(value: float) -> str:
+    return f"{value:.4g}"
+
+
+def _range(low: float, high: float) -> str:
+    if np.isnan(low) or low == high:
+        return "none" if np.isnan(low) else f"always {_number(low)}"
+    return "unbounded" if np.isinf([low, high]).all() else f"{_number(low)} to {_number(high)}"
+
+
+def _table(title: str, entries: Sequence[Entry], seen: bool) -> Table:
+    """One row for each entry. `seen`: with the range in the random steps, and the index in what the agent observes."""
+    caption = f"and {len(entries) - MOST_ROWS} more entries" if len(entries) > MOST_ROWS else None
+    table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
+    for heading in ("index", "name", "declared", *(("seen", "agent's index") if seen else ())):
+        table.add_column(heading, justify="left" if heading == "name" else "right")
+    for entry in entries[:MOST_ROWS]:
+        position = "hidden" if entry.position is None else str(entry.position)
+        more = (_range(entry.seen_low, entry.seen_high), position) if seen else ()
+        table.add_row(*map(Text, (str(entry.index), entry.name, _range(entry.low, entry.high), *more)))
+    return table
