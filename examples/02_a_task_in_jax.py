@@ -43,10 +43,6 @@ class Lamp:
         reward = jnp.where(time + 1 == self.wait, side * action[0], 0.0)
         return (side, time + 1), jnp.zeros(1), reward, jnp.array(False)
 
-    def success(self, state: tuple[Array, Array]) -> Bool[Array, ""]:
-        """Not used, since `has_success` of the spec is False."""
-        return jnp.array(False)
-
 
 SMALL = {"policy_layers": (64, 64), "value_layers": (64, 64), "step_start_rl": 300, "pretrain_updates": 0}
 FAST = {"lr_actor": 1e-3, "lr_critic": 1e-3}

@@ -83,7 +83,7 @@ class Counting:
 
     @property
     def spec(self):
-        return Spec(obs_dim=1, action_dim=1, max_steps=self.max_steps, has_success=True)
+        return Spec(obs_dim=1, action_dim=1, max_steps=self.max_steps, measures=("success",))
 
     def reset(self, key):
         return jnp.array(0), jnp.zeros(1)
@@ -92,8 +92,8 @@ class Counting:
         state = state + 1
         return state, state[None].astype(float), state.astype(float), state >= self.ends
 
-    def success(self, state):
-        return state >= 5
+    def measures(self, state):
+        return {"success": state >= 5}
 
 
 class CountingState(NamedTuple):

@@ -87,7 +87,7 @@ class Spec(NamedTuple):
     obs_dim: int  # numbers in an observation
     action_dim: int  # degrees of freedom; every action lies in [-1, 1]
     max_steps: int  # time limit of an episode: it truncates, it does not terminate
-    has_success: bool = False  # whether the task says if an episode was successful
+    measures: tuple[str, ...] = ()  # what the task reports of an episode besides return and length, such as "success"
 
 
 class Timestep(NamedTuple):

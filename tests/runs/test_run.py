@@ -328,7 +328,8 @@ def test_finish_writes_the_results(recorder):
         RESULTS | {"mode": MODE | {"seeds": [1.0]}},
         RESULTS | {"mode": MODE | {"seeds": [1.0, "two"]}},
         RESULTS | {"mode": MODE | {"success": 0.5}},
-        RESULTS | {"mode": MODE | {"success": 0.5, "seeds_success": [0.5, None]}},
+        RESULTS | {"mode": MODE | {"success": 0.5, "seeds_success": [0.5, "none"]}},
+        RESULTS | {"mode": MODE | {"distance": None, "seeds_distance": [0.5, None]}},
         RESULTS | {"mode": {name: value for name, value in MODE.items() if name != "sem"}},
     ],
 )

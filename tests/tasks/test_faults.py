@@ -32,9 +32,6 @@ class Echo:
     def step(self, state, action, key):
         return action[0], jnp.stack([jnp.array(5.0), action[0]]), action[0], jnp.array(False)
 
-    def success(self, state):
-        return jnp.array(False)
-
 
 class HostEcho(Counter):
     """The same as a Gymnasium environment."""

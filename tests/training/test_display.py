@@ -115,7 +115,7 @@ FLAT = {"mean": 1.0, "sem": None, "seeds": [1.0], "success": None}
 
 
 def evaluation(value):
-    return Episode(*(np.full((1, 2, 3), each) for each in (True, value, 10, False)))
+    return Episode(*(np.full((1, 2, 3), each) for each in (True, value, 10)), {})
 
 
 def test_a_terminal_keeps_the_evaluations_and_replaces_the_rest(run):

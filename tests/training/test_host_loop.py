@@ -51,7 +51,7 @@ class Wrapped(gymnasium.Env):
         self.state, obs, reward, terminated = self._step(self.state, jnp.asarray(action), jax.random.key(0))
         self.time += 1
         end = bool(terminated), self.time >= self.task.spec.max_steps
-        return np.asarray(obs), float(reward), *end, {"is_success": bool(self.task.success(self.state))}
+        return np.asarray(obs), float(reward), *end, {"is_success": bool(self.task.measures(self.state)["success"])}
 
 
 @pytest.mark.parametrize("name", ["sac-mlp", pytest.param("vrm", marks=pytest.mark.slow)])
@@ -77,7 +77,7 @@ def test_the_host_loop_learns_what_the_compiled_loop_learns(name):
 
 def test_every_window_is_unbroken_in_time():
     task = Counting()
-    wrapped = GymnasiumTask(Wrapped, "counting", {"task": task}, has_success=True)
+    wrapped = GymnasiumTask(Wrapped, "counting", {"task": task}, measures=("success",))
     program = host_loop.program(CountingAgent(), wrapped, 60, 3, range(2), "never")
     seeds = program.begin(jax.random.split(jax.random.key(0), 2))
     seeds, log = program.explore(seeds, 0, 10)
@@ -88,7 +88,7 @@ def test_every_window_is_unbroken_in_time():
     assert np.all(log.metrics["valid"] > 0)
     assert not np.any(log.metrics["broken"])
     np.testing.assert_allclose(log.episodes.episode_return[log.episodes.done], 28.0)
-    assert np.all(log.episodes.success[log.episodes.done])
+    assert np.all(log.episodes.measures["success"][log.episodes.done])
     result = program.evaluate(seeds.state, seeds.key)
     np.testing.assert_allclose(result.episode_return, np.full((2, 2, 3), 28.0))
     assert result.done.all()
@@ -99,9 +99,9 @@ def played(lanes, steps=25):
     seen = [lanes.reset(np.array([3, 4]))]
     actions = np.random.default_rng(0).uniform(-1, 1, (steps, 2, 1)).astype(np.float32)
     for action in actions:
-        obs, reward, terminated, truncated, success = lanes.step(action)
+        obs, reward, terminated, truncated, measures = lanes.step(action)
         done = terminated | truncated
-        seen += [obs, reward, done, success]
+        seen += [obs, reward, done, *measures.values()]
         if done.any():
             seen.append(lanes.restart(done))
     lanes.close()

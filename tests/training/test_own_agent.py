@@ -12,13 +12,15 @@ import pytest
 
 import beliefrl
 from beliefrl.agents.vrm import VRMAgent
+from beliefrl.analysis.curves import curve_figure
 from beliefrl.analysis.scalability import parameters
 from beliefrl.models.nets import Gaussian
 from beliefrl.runs import arrays
+from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import phases
 from beliefrl.training.evaluation import agent_of
 from beliefrl.types import UserError, perception
-from worlds import Counting, CountingAgent
+from worlds import Counter, Counting, CountingAgent
 
 OPTIONS = {"steps": 20, "eval_every": 20, "eval_episodes": 1, "checkpoint_steps": 10}
 
@@ -202,3 +204,59 @@ def test_two_metrics_of_one_name_are_refused():
     seed = phases.begin(agent, Counting(), 100, jax.random.key(0))
     with pytest.raises(UserError, match="both return a metric 'valid'"):
         jax.eval_shape(lambda seed: phases.learn_cycle(agent, seed, jnp.array(10)), seed)
+
+
+# What a task measures of an episode goes everywhere by itself.
+
+
+class Walk(Counting):
+    """Counts its steps as metres."""
+
+    @property
+    def spec(self):
+        return super().spec._replace(measures=("success", "metres"))
+
+    def measures(self, state):
+        return super().measures(state) | {"metres": state}
+
+
+class WalkingEnvironment(Counter):
+    """The same in Gymnasium; its info has the metres at every other step."""
+
+    def step(self, action):
+        *step, info = super().step(action)
+        return *step, info | ({"metres": self.steps} if self.steps % 2 else {})
+
+
+@pytest.mark.parametrize("task", [Walk(), GymnasiumTask(WalkingEnvironment, max_steps=7, measures=("metres",))])
+def test_a_measure_is_logged_evaluated_shown_and_drawn(task, tmp_path, capsys):
+    options = {"steps": 14, "seeds": 2, "eval_every": 7, "eval_episodes": 2}
+    run = beliefrl.train(CountingAgent(), task, tmp_path / "run", **options)
+    assert [row["metres"] for row in run.rows(0, "episode")] == [7.0, 7.0]
+    assert [row["sampled_metres"] for row in run.rows(1, "evaluation")] == [[7.0, 7.0]] * 2
+    assert run.results()["mode"]["metres"] == 7.0
+    assert run.results()["mode"]["seeds_metres"] == [7.0, 7.0]
+    printed = capsys.readouterr().out
+    assert "metres 7 sampled, 7 mode" in printed
+    assert curve_figure(run).axes[-1].get_ylabel() == "metres"
+
+
+def test_a_task_that_does_not_return_its_measures_is_refused(tmp_path):
+    class Less(Walk):
+        def measures(self, state):
+            return {"metres": state}
+
+    class Length(Walk):
+        @property
+        def spec(self):
+            return super().spec._replace(measures=("length",))
+
+        def measures(self, state):
+            return {"length": state}
+
+    for task, error in ((Less(), "so return these"), (Length(), "choose another name")):
+        with pytest.raises(UserError, match=error):
+            beliefrl.train(CountingAgent(), task, tmp_path / "run", steps=7, progress=False)
+    task = GymnasiumTask(Counter, max_steps=7, measures=("metres",))
+    with pytest.raises(UserError, match="has a number 'metres', which the task measures"):
+        beliefrl.train(CountingAgent(), task, tmp_path / "other", steps=7, progress=False)

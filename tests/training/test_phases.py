@@ -9,6 +9,7 @@ from beliefrl import agents, tasks
 from beliefrl.runs.options import Options
 from beliefrl.training import phases, schedule
 from beliefrl.training.evaluation import evaluate, summary
+from beliefrl.training.log import without
 from beliefrl.training.rollout import Episode
 from beliefrl.types import UserError
 from worlds import MODELS, SEQUENCES, SHARED, Counting, CountingAgent, leaves, trained
@@ -190,11 +191,12 @@ SUCCESS = np.array([[[1, 0], [1, 1]], [[0, 0], [0, 1]], [[1, 1], [0, 0]]], bool)
 
 
 def episode(total, success):
-    return Episode(jnp.ones(total.shape, bool), jnp.array(total), jnp.ones(total.shape, int), jnp.array(success))
+    done, length = jnp.ones(total.shape, bool), jnp.ones(total.shape, int)
+    return Episode(done, jnp.array(total), length, {"success": jnp.array(success, float)})
 
 
 def test_means_and_standard_errors_are_over_seeds():
-    table = summary(episode(TOTAL, SUCCESS), has_success=True)
+    table = summary(episode(TOTAL, SUCCESS))
     assert list(table) == ["sampled", "mode"]
     for mode, seeds in {"sampled": [1.5, 4.5, 1.5], "mode": [20.0, -20.0, 3.0]}.items():
         assert table[mode]["seeds"] == seeds
@@ -203,20 +205,27 @@ def test_means_and_standard_errors_are_over_seeds():
 
 
 def test_success_is_a_rate():
-    table = summary(episode(TOTAL, SUCCESS), has_success=True)
+    table = summary(episode(TOTAL, SUCCESS))
     assert table["sampled"]["seeds_success"] == [0.5, 0.0, 1.0]
     assert table["sampled"]["success"] == 0.5
     assert table["mode"]["seeds_success"] == [1.0, 0.5, 0.0]
 
 
+def test_a_lost_seed_has_no_success_and_does_not_count():
+    table = summary(without(episode(TOTAL, SUCCESS), {1}))
+    assert table["sampled"]["seeds_success"] == [0.5, None, 1.0]
+    assert table["sampled"]["success"] == 0.75
+    assert table["sampled"]["seeds"] == [1.5, None, 1.5]
+
+
 def test_one_seed_has_no_standard_error():
-    table = summary(episode(TOTAL[:1], SUCCESS[:1]), has_success=True)
+    table = summary(episode(TOTAL[:1], SUCCESS[:1]))
     assert table["sampled"]["sem"] is None
     assert table["sampled"]["mean"] == 1.5
 
 
 def test_a_task_without_success_reports_none():
-    table = summary(episode(TOTAL, SUCCESS), has_success=False)
+    table = summary(episode(TOTAL, SUCCESS)._replace(measures={}))
     assert table["mode"]["success"] is None
     assert table["mode"]["seeds_success"] is None
 

@@ -79,9 +79,6 @@ class Recall:
         reward = jnp.where(time == self.delay, action[0] * sign, told)
         return (sign, time + 1), self.observation(sign, time + 1), reward, time == self.delay
 
-    def success(self, state):
-        return jnp.array(False)
-
 
 def learn(task, steps, seeds=1, **hyperparameters):
     """Train a small VRM; returns the last stretch's metrics and the mode actions' mean return."""

@@ -72,7 +72,7 @@ def test_memory_counts_unbroken_through_every_episode():
 def test_success_is_reported_where_the_episode_ends():
     for ends, success in ((4, False), (6, True)):
         _, episodes, _ = advanced(Counting(ends=ends), 12)
-        np.testing.assert_array_equal(episodes.success[episodes.done], success)
+        np.testing.assert_array_equal(episodes.measures["success"][episodes.done], success)
 
 
 @pytest.mark.parametrize("steps", [10, 14])
@@ -97,4 +97,4 @@ def test_evaluation_plays_whole_episodes_and_stops_counting_at_their_end():
         assert result.done.all()
         np.testing.assert_array_equal(result.episode_return, total)
         np.testing.assert_array_equal(result.length, length)
-        np.testing.assert_array_equal(result.success, length >= 5)
+        np.testing.assert_array_equal(result.measures["success"], length >= 5)

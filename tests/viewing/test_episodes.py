@@ -23,14 +23,14 @@ def player(task=TASK, name="sac-lstm", rendered=False):
 @pytest.mark.parametrize(("ends", "last"), [(1000, 7), (4, 4)])
 def test_every_timestep_is_where_it_belongs(ends, last):
     agent, task = CountingAgent(), Counting(ends)
-    steps, total, success, frames = Player(agent, task, agent.init(jax.random.key(0), task.spec)).play()
+    steps, total, measures, frames = Player(agent, task, agent.init(jax.random.key(0), task.spec)).play()
     assert steps.obs.ravel().tolist() == list(range(last + 1))
     assert steps.reward.tolist() == list(range(last + 1))  # what came with the count
     assert steps.prev_action.ravel().tolist() == [0.0] + [0.5] * last
     assert steps.is_first.tolist() == [True] + [False] * last
     assert steps.terminated.tolist() == [False] * last + [ends == 4]
     assert total == sum(range(last + 1))
-    assert success is (last >= 5)
+    assert measures == {"success": float(last >= 5)}
     assert frames == {}
 
 
@@ -71,11 +71,11 @@ def test_frames_are_of_the_timesteps_asked_for_and_the_last():
 
 def test_a_gymnasium_environment_is_played_and_seen_in_the_same_way():
     with player(GymnasiumTask(Counter, arguments={"ends": 4}), "sac-mlp", rendered=True) as playing:
-        steps, total, success, frames = playing.play(at=range(100))
+        steps, total, measures, frames = playing.play(at=range(100))
     assert steps.obs[:, 1].tolist() == [0, 1, 2, 3, 4]
     assert steps.terminated.tolist() == [False] * 4 + [True]
     assert total == 10
-    assert success is None
+    assert measures == {}
     assert {time: frame[0, 0, 0] for time, frame in frames.items()} == {0: 0, 1: 10, 2: 20, 3: 30, 4: 40}
 
 

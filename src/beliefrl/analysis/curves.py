@@ -18,6 +18,11 @@ def evaluations(run: Run, name: str) -> Curve:
     return Group(task_of(run), run.config["agent"], [(run, seed) for seed in run.seeds]).curve(name)
 
 
+def axis_label(measure: str) -> str:
+    """The label of an axis for a measure; "" is the return."""
+    return {"": "return", "success": "success rate"}.get(measure, measure)
+
+
 def standard_error(seeds: np.ndarray) -> np.ndarray:
     """S.E.M. over the first axis, ignoring NaN; 0 if there is only one value."""
     count = np.sum(~np.isnan(seeds), axis=0)
@@ -28,7 +33,7 @@ def standard_error(seeds: np.ndarray) -> np.ndarray:
 def draw_curve(run: Run, path: pathlib.Path | str | None = None) -> pathlib.Path:
     """Draw a run's evaluation returns over environment steps; returns the path of the picture.
 
-    A task with a success flag gets a second panel with the success rate. Each seed is a thin line, the mean a thick
+    Each measure of the task, such as success, has another panel. Each seed is a thin line, the mean a thick
     line, and the S.E.M. a band. Without `path` the picture is curve.png in the run's folder.
 
     Raises:
@@ -45,24 +50,22 @@ def curve_figure(run: Run) -> Any:
     Raises:
         UserError: there is no evaluation yet.
     """
-    if not evaluations(run, "sampled").steps.size:
+    group = Group(task_of(run), run.config["agent"], [(run, seed) for seed in run.seeds])
+    if not group.curve("sampled").steps.size:
         raise UserError(f"{run.folder} has no evaluation of every seed yet, so there is no curve to draw.")
-    panels = [("return", "")]
-    if any("sampled_success" in row for row in run.rows(run.seeds[0], "evaluation")):
-        panels.append(("success rate", "_success"))
-
+    panels = ["", *group.measures]
     made = figure(5.6 * len(panels), 3.6)
     axes = made.subplots(1, len(panels), squeeze=False)[0]
-    for axis, (label, suffix) in zip(axes, panels, strict=True):
+    for axis, measure in zip(axes, panels, strict=True):
         for mode, colour in COLOURS.items():
-            steps, seeds = evaluations(run, mode + suffix)
+            steps, seeds = group.curve(f"{mode}_{measure}" if measure else mode)
             mean, error = np.nanmean(seeds, axis=0), standard_error(seeds)
             for seed in seeds if len(seeds) > 1 else []:
                 axis.plot(steps, seed, color=colour, linewidth=0.6, alpha=0.4)
             axis.plot(steps, mean, color=colour, linewidth=2, label=f"{mode} actions", marker="o", markersize=3)
             axis.fill_between(steps, mean - error, mean + error, color=colour, alpha=0.2, linewidth=0)
         axis.set_xlabel("environment steps")
-        axis.set_ylabel(label)
+        axis.set_ylabel(axis_label(measure))
         axis.grid(alpha=0.25)
         axis.spines[["top", "right"]].set_visible(False)
     count = len(run.seeds)

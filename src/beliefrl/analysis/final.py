@@ -10,7 +10,7 @@ from beliefrl.analysis.curves import standard_error
 from beliefrl.analysis.groups import Curve, Group
 from beliefrl.analysis.panels import counts
 from beliefrl.analysis.scalability import hours, wall_clock
-from beliefrl.analysis.tables import Column, write_table
+from beliefrl.analysis.tables import Column, measure_text, write_table
 
 SOLVED = 0.95  # score (`aggregate`): a return of -203 on the pendulum, 951 on CartPole, 133 on target reaching
 
@@ -39,15 +39,14 @@ def rows(groups: Sequence[Group]) -> list[tuple[str, ...]]:
         spans = [wall_clock(run) for run in group.runs]
         known = [span for span in spans if span is not None]
         seconds = sum(known) / sum(len(run.seeds) for run in group.runs) if len(known) == len(spans) else None
-        success = ("sampled_success", "mode_success") if group.has_success else ("", "")
         table.append(
             (
                 f"`{group.task}`",
                 f"`{group.label}`",
                 counts([seed for _, seed in group.seeds]),
                 f"{sampled.steps[-1]:,}",
-                _final(sampled) + _rate(group, success[0]),
-                _final(mode) + _rate(group, success[1]),
+                _final(sampled) + _measures(group, "sampled"),
+                _final(mode) + _measures(group, "mode"),
                 _solved(group.task, sampled, mode),
                 "unknown" if seconds is None else hours(seconds),
             )
@@ -60,8 +59,9 @@ def _final(curve: Curve) -> str:
     return f"{np.nanmean(curve.seeds[:, -1]):.1f}{error}"
 
 
-def _rate(group: Group, name: str) -> str:
-    return f"; success {np.nanmean(group.curve(name).seeds[:, -1]):.0%}" if name else ""
+def _measures(group: Group, mode: str) -> str:
+    last = {name: float(np.nanmean(group.curve(f"{mode}_{name}").seeds[:, -1])) for name in group.measures}
+    return "".join(f"; {name} {measure_text(name, value)}" for name, value in last.items())
 
 
 def _solved(task: str, *curves: Curve) -> str:

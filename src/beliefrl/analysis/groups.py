@@ -48,15 +48,17 @@ class Group:
         return [list(run.rows(seed, "evaluation")) for run, seed in self.seeds]
 
     def curve(self, name: str = "sampled") -> Curve:
-        """An entry of the evaluations (sampled, mode, sampled_success, mode_success), at steps that all seeds have."""
+        """An entry of the evaluations (sampled, mode, sampled_success, ...), at steps that all seeds have."""
         table = [{row["step"]: float(np.mean(row[name])) for row in rows if name in row} for rows in self.evaluations]
         healthy = [means for means, (run, seed) in zip(table, self.seeds, strict=True) if not _diverged(run, seed)]
         steps = sorted(set.intersection(*map(set, healthy or table)))
         return Curve(np.array(steps), np.array([[seed.get(step, np.nan) for step in steps] for seed in table]))
 
     @property
-    def has_success(self) -> bool:
-        return any("sampled_success" in row for rows in self.evaluations for row in rows)
+    def measures(self) -> list[str]:
+        """What is recorded of an episode besides return and length, such as "success"."""
+        names = dict.fromkeys(name for rows in self.evaluations for row in rows for name in row)
+        return [name.removeprefix("sampled_") for name in names if name.startswith("sampled_")]
 
 
 class FoundRuns(NamedTuple):

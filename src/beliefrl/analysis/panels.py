@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from beliefrl.analysis.curves import standard_error
+from beliefrl.analysis.curves import axis_label, standard_error
 from beliefrl.analysis.figures import figure, save
 from beliefrl.analysis.groups import Curve, Group
 from beliefrl.analysis.palette import colours, dashes
@@ -20,7 +20,8 @@ DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (7, 2, 1.5, 2)), (0, (3, 1, 1, 
 
 
 def draw_curves(groups: Sequence[Group], out: pathlib.Path, mode: str = "sampled") -> pathlib.Path:
-    """Draw returns over environment steps, mean and S.E.M. over seeds. A task with success has another panel for it.
+    """Draw returns over environment steps, mean and S.E.M. over seeds. Each measure of a task, such as
+    success, has another panel.
 
     Args:
         groups: the lines; groups of the same task share a panel.
@@ -35,17 +36,18 @@ def draw_curves(groups: Sequence[Group], out: pathlib.Path, mode: str = "sampled
     """
     groups = with_curve(groups, mode)
     entries = [(task, "") for task in tasks_of(groups)]
-    entries += [(task, "_success") for task in tasks_of([group for group in groups if group.has_success])]
+    for name in dict.fromkeys(name for group in groups for name in group.measures):
+        entries += [(task, name) for task in tasks_of([group for group in groups if name in group.measures])]
     labels = list(dict.fromkeys(group.label for group in groups))
     colour = colours(labels)
     style = {label: DASHES[number % len(DASHES)] for label, number in dashes(labels).items()}
     made, axes = panels(len(entries), labels)
-    for axis, (task, suffix) in zip(axes, entries, strict=True):
+    for axis, (task, measure) in zip(axes, entries, strict=True):
         for group in groups:
-            if group.task == task and (not suffix or group.has_success):
-                label = group.label
-                draw_line(axis, group.curve(mode + suffix), colour[label], label, linestyle=style[label])
-        finish(axis, task, "success rate" if suffix else "return")
+            if group.task == task and (not measure or measure in group.measures):
+                label, name = group.label, f"{mode}_{measure}" if measure else mode
+                draw_line(axis, group.curve(name), colour[label], label, linestyle=style[label])
+        finish(axis, task, axis_label(measure))
     add_legend(made, {label: colour[label] for label in labels}, spread(groups), style)
     return save(made, out)
 

@@ -16,6 +16,13 @@ class Column(NamedTuple):
 Cells = Sequence[str]
 
 
+def measure_text(name: str, value: float | None) -> str:
+    """A measure of episodes as text; success is a rate. A diverged seed has None."""
+    if value is None:
+        return "diverged"
+    return f"{value:.0%}" if name == "success" else f"{value:.4g}"
+
+
 def markdown(columns: Sequence[Column], rows: Sequence[Cells]) -> str:
     """The table in Markdown."""
     cells = [[cell.replace("|", r"\|") for cell in row] for row in rows]

@@ -111,9 +111,8 @@ def video(argv: Sequence[str]) -> None:
         options.run, options.out, agent=own_agent(options.agent), **{name: getattr(options, name) for name in names}
     )
     for index, episode in enumerate(played):
-        reached = {None: "", True: ", success", False: ", no success"}[episode.success]
         length = len(episode.steps.reward) - 1
-        print(f"episode {options.episode_seed + index}: {length} steps, return {episode.total:.1f}{reached}")
+        print(f"episode {options.episode_seed + index}: {length} steps, {episode.summary}")
     print(f"written to {options.out}")
 
 

@@ -67,7 +67,8 @@ def _has_begun(run: Run) -> bool:
 
 
 def _group(group: Group) -> dict[str, Any]:
-    names = [mode + suffix for suffix in ("", "_success") if not suffix or group.has_success for mode in MODES]
+    suffixes = ("", "_success") if "success" in group.measures else ("",)
+    names = [mode + suffix for suffix in suffixes for mode in MODES]
     curves = {name: group.curve(name) for name in names}
     diverged = {seed: row["step"] for run, seed in group.seeds for row in run.rows(seed, "diverged")}
     return {

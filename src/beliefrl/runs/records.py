@@ -156,11 +156,18 @@ def _is_mode(mode: Any, seeds: int) -> bool:
     """Whether `mode` is the part of a summary for one kind of actions."""
     if not isinstance(mode, dict) or not {"mean", "sem", "seeds", "success", "seeds_success"} <= mode.keys():
         return False
-    returns, rates = mode["seeds"], mode["seeds_success"]
+    returns = mode["seeds"]
     if not isinstance(returns, list) or len(returns) != seeds or not _is_number(mode["mean"]):
         return False
-    if (rates is None) != (mode["success"] is None):
-        return False
-    if rates is not None and not (_are_numbers(rates) and len(rates) == seeds and _is_number(mode["success"])):
-        return False
-    return all(value is None or _is_number(value) for value in (mode["sem"], *returns))
+    for name in (key.removeprefix("seeds_") for key in mode if key.startswith("seeds_")):
+        of_seeds, mean = mode[f"seeds_{name}"], mode.get(name)
+        if (of_seeds is None) != (mean is None):
+            return False
+        if of_seeds is not None and not (_are_known(of_seeds) and len(of_seeds) == seeds and _is_number(mean)):
+            return False
+    return _are_known([mode["sem"], *returns])
+
+
+def _are_known(values: Any) -> bool:
+    """Whether this is a list of numbers, or None for what a seed does not have."""
+    return isinstance(values, list) and all(value is None or _is_number(value) for value in values)

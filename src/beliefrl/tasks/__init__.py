@@ -27,7 +27,9 @@ class Task(Protocol):
     `rollout` truncates episodes at `spec.max_steps` and resets them. Two members are optional. A task that can be
     rendered has a method `draw(states)`, which returns the `drawing.Picture` of an episode's states so far. A task may
     have `entry_names`, a tuple with the name of each entry of its observation, followed by the unit in brackets, for
-    the labels in figures: ("cos θ", "sin θ", "θ̇ (rad/s)").
+    the labels in figures: ("cos θ", "sin θ", "θ̇ (rad/s)"). If `spec.measures` names numbers that are recorded of each
+    episode, such as "success" or a distance, a method `measures(state)` returns them by name; those at the last state
+    count.
     """
 
     @property
@@ -43,10 +45,6 @@ class Task(Protocol):
         self, state: Any, action: Float[Array, " action"], key: Key[Array, ""]
     ) -> tuple[Any, Float[Array, " obs"], Float[Array, ""], Bool[Array, ""]]:
         """Apply an action in [-1, 1]; returns the next state, its observation, the reward, and terminated."""
-        ...
-
-    def success(self, state: Any) -> Bool[Array, ""]:
-        """Whether the episode has succeeded; always False if `spec.has_success` is False."""
         ...
 
 
@@ -74,8 +72,8 @@ class Observed:
         state, obs, reward, terminated = self.task.step(state, action, key)
         return state, self._see(obs), reward, terminated
 
-    def success(self, state: Any) -> Bool[Array, ""]:
-        return self.task.success(state)
+    def measures(self, state: Any) -> dict[str, Array]:
+        return self.task.measures(state)
 
 
 def observe(task: Any, indices: tuple[int, ...]) -> Any:

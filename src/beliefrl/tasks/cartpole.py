@@ -89,9 +89,6 @@ class CartPole:
         terminated = (jnp.abs(state.x) > self.max_x) | (jnp.abs(state.theta) > self.max_theta)
         return state, jnp.stack(state), jnp.array(1.0), terminated
 
-    def success(self, state: CartPoleState) -> Bool[Array, ""]:
-        return jnp.array(False)
-
     def draw(self, states: Sequence[CartPoleState]) -> Picture:
         """The cart on its track, the ends of the track, the pole, and its permitted range of angles."""
         x, theta = float(states[-1].x), float(states[-1].theta)

@@ -35,19 +35,20 @@ def _reset(task: Task, seed: Any) -> tuple[Key[Array, ""], Any, Float[Array, " o
 @functools.partial(jax.jit, static_argnums=0)
 def _step(
     task: Task, key: Key[Array, ""], state: Any, action: Float[Array, " action"]
-) -> tuple[Key[Array, ""], Any, Float[Array, " obs"], Float[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
-    """The next key and state, then the observation, reward, terminated and success."""
+) -> tuple[Key[Array, ""], Any, Float[Array, " obs"], Float[Array, ""], Bool[Array, ""], dict[str, Any]]:
+    """The next key and state, then the observation, reward, terminated and the task's measures."""
     key, now = jax.random.split(key)
     # Gaussian policies of other libraries may exceed [-1, 1], but a Task expects actions in this range.
     state, obs, reward, terminated = task.step(state, jnp.clip(action, -1.0, 1.0), now)
-    return key, state, obs, reward, terminated, task.success(state)
+    measures: Any = task.measures(state) if task.spec.measures else {}  # pyright: ignore[reportAttributeAccessIssue]
+    return key, state, obs, reward, terminated, measures
 
 
 class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
     """A task as a Gymnasium environment.
 
-    Observations are (obs_dim,) float32. Actions (action_dim,) are clipped to [-1, 1]. If `spec.has_success`,
-    `info["is_success"]` says after each step whether the episode has succeeded.
+    Observations are (obs_dim,) float32. Actions (action_dim,) are clipped to [-1, 1]. `info` has the
+    measures of the task (`spec.measures`) after each step; success is called `is_success` there.
 
     The environment has no time limit. `gymnasium.make` adds one: the task's `max_steps`, or the argument
     `max_episode_steps`. For a task of your own, use
@@ -133,8 +134,9 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         self._key, state, *outcome = _step(self.task, self._key, self._states[-1], action)
         self._states = [*self._states, state] if self.render_mode else [state]
         self._show()
-        obs, reward, terminated, success = jax.device_get(outcome)
-        info = {"is_success": bool(success)} if self.task.spec.has_success else {}
+        obs, reward, terminated, measures = jax.device_get(outcome)
+        info = {name: float(value) for name, value in measures.items() if name != "success"}
+        info |= {"is_success": bool(measures["success"])} if "success" in measures else {}
         return np.array(obs), float(reward), bool(terminated), False, info
 
     def _picture(self) -> Picture:

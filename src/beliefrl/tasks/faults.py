@@ -177,8 +177,8 @@ class Faulty:
         waiting, seen = self.faults.observe(jnp, state.waiting, obs, draws)
         return FaultyState(inner, waiting, action), seen, reward, terminated
 
-    def success(self, state: FaultyState) -> Bool[Array, ""]:
-        return self.task.success(state.task)
+    def measures(self, state: FaultyState) -> dict[str, Array]:
+        return self.task.measures(state.task)
 
     def _draws(self, key: Key[Array, ""]) -> Draws:
         size = (self.task.spec.obs_dim,)

@@ -43,8 +43,8 @@ class GymnasiumTask:
     """Entries of the flat observation that the agent sees; None: all."""
     max_steps: int | None = None
     """Time limit in steps, which truncates episodes; None: the environment's own limit."""
-    has_success: bool = False
-    """Whether the environment's info has `is_success` or `success`; the success rate is then logged."""
+    measures: tuple[str, ...] = ()
+    """Entries of the environment's info to log for each episode, as last reported; `is_success` is "success", too."""
     faults: Faults = NONE
     """Missing and faulty sensors."""
 
@@ -66,7 +66,7 @@ class GymnasiumTask:
         environment.close()
         actions = environment.inner_action_space
         size = self.faults.observed_size(environment.indices.size)
-        return Spec(size, actions.low.size, environment.limit or LARGEST, self.has_success)
+        return Spec(size, actions.low.size, environment.limit or LARGEST, self.measures)
 
     @cached_property
     def entry_names(self) -> tuple[str, ...]:
@@ -113,6 +113,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         """Make the environment and check its spaces."""
         self.task, self.seed = task, seed
         self.steps, self.length = 0, 0  # in total, and in this episode
+        self._measured: dict[str, float] = {}  # in this episode
         self.inner = task.bare()
         self.inner_action_space: Any = getattr(self.inner, "action_space", None)
         self.inner_observation_space: Any = getattr(self.inner, "observation_space", None)
@@ -132,7 +133,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode."""
-        self.length = 0
+        self.length, self._measured = 0, {}
         result = self._call("reset", lambda: self.inner.reset(seed=seed, options=options))
         if not (isinstance(result, tuple) and len(result) == 2):
             raise self._fault("reset did not return (observation, info)")
@@ -154,7 +155,17 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
                 f"the episode has not ended after {self.length} steps: fix the environment, or give it a time limit "
                 "with max_episode_steps"
             )
-        return obs, reward, terminated, truncated, {"success": success_of(info)}
+        return obs, reward, terminated, truncated, self._measures(info, terminated or truncated)
+
+    def _measures(self, info: Any, ended: bool) -> dict[str, Any]:
+        """The task's measures as the infos of this episode reported them last; 0 before the first report."""
+        for name in self.task.measures:
+            value = measure_of(info, name)
+            if value is not None:
+                self._measured[name] = value
+            elif ended and name not in self._measured:
+                raise self._fault(f"no info of an episode has a number {name!r}, which the task measures")
+        return dict.fromkeys(self.task.measures, 0.0) | self._measured
 
     def render(self) -> Any:
         """The picture that the environment renders."""
@@ -276,9 +287,15 @@ class FaultyEnvironment(Environment):
         return Draws(normal(size, np.float32), uniform(size, np.float32), uniform(), uniform())
 
 
-def success_of(info: Any) -> bool:
-    """Whether the info of a step reports success, as `is_success` or `success`."""
-    return isinstance(info, dict) and bool(np.any(info.get("is_success", info.get("success", False))))
+def measure_of(info: Any, name: str) -> float | None:
+    """A number in the info of a step, or None. Success may be called `is_success`, and is 0 if absent."""
+    found = info if isinstance(info, dict) else {}
+    value: Any = found.get("is_success", found.get("success", 0.0)) if name == "success" else found.get(name)
+    try:
+        number = float(np.max(value))
+    except (TypeError, ValueError):
+        return None
+    return number if np.isfinite(number) else None
 
 
 def _array(value: Any) -> np.ndarray:

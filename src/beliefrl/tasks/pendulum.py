@@ -77,9 +77,6 @@ class Pendulum:
         state = PendulumState(theta + theta_dot * self.dt, theta_dot)
         return state, self.observation(state), reward, jnp.array(False)
 
-    def success(self, state: PendulumState) -> Bool[Array, ""]:
-        return jnp.array(False)
-
     def draw(self, states: Sequence[PendulumState]) -> Picture:
         """The rod, its hub, and the path of its tip in the last half second. θ grows anticlockwise."""
         angles = np.array([state.theta for state in states[-round(0.5 / self.dt) - 1 :]])

@@ -76,7 +76,7 @@ class TargetReaching:
 
     @property
     def spec(self) -> Spec:
-        return Spec(obs_dim=12, action_dim=2, max_steps=self.max_steps, has_success=True)
+        return Spec(obs_dim=12, action_dim=2, max_steps=self.max_steps, measures=("success",))
 
     def draw_targets(self, key: Key[Array, ""]) -> Float[Array, "3 2"]:
         """Three uniform targets in the middle square, redrawn until no two are too close."""
@@ -134,10 +134,10 @@ class TargetReaching:
 
         heading = (state.heading + turn) % (2 * jnp.pi)
         state = TargetReachingState(position, heading, state.targets, state.reached + reached, reward)
-        return state, self.observation(state), reward, self.success(state)
+        return state, self.observation(state), reward, state.reached >= 3
 
-    def success(self, state: TargetReachingState) -> Bool[Array, ""]:
-        return state.reached >= 3
+    def measures(self, state: TargetReachingState) -> dict[str, Array]:
+        return {"success": state.reached >= 3}
 
     def draw(self, states: Sequence[TargetReachingState]) -> Picture:
         """The field, the targets with a tick on those reached, and the robot with its path so far."""

@@ -50,9 +50,6 @@ class Noise:
     ) -> tuple[tuple[()], Float[Array, " obs"], Float[Array, ""], Bool[Array, ""]]:
         return (), jax.random.normal(key, (self.obs_dim,)), jnp.mean(action), jnp.array(False)
 
-    def success(self, state: tuple[()]) -> Bool[Array, ""]:
-        return jnp.array(False)
-
 
 def median_seconds(call: Callable[[], Any], repeats: int = REPEATS) -> float:
     """The median time of a call, once it has run; waits for its result."""

@@ -9,6 +9,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 from beliefrl.analysis.curves import curve_figure
+from beliefrl.analysis.tables import measure_text
 from beliefrl.runs.run import Run
 from beliefrl.training.evaluation import as_argument
 from beliefrl.training.schedule import Event, Phase
@@ -85,11 +86,11 @@ class TrainingDisplay:
     def _evaluated(self, event: Event) -> None:
         result = event.evaluation
         assert result is not None
-        returns, success = np.asarray(result.episode_return), np.asarray(result.success)
-        sampled, mode = np.nanmean(returns, axis=(0, 2))  # diverged seeds are NaN
+        sampled, mode = np.nanmean(result.episode_return, axis=(0, 2))  # diverged seeds are NaN
         line = f"step {event.step:,}: return {sampled:.1f} sampled, {mode:.1f} mode"
-        if success.any():
-            line += f"; success {success[:, 0].mean():.0%} sampled, {success[:, 1].mean():.0%} mode"
+        for name, values in result.measures.items():
+            sampled, mode = (measure_text(name, float(value)) for value in np.nanmean(values, axis=(0, 2)))
+            line += f"; {name} {sampled} sampled, {mode} mode"
         self.screen.line(line)
         self.screen.picture(self._curve)
 
@@ -117,19 +118,19 @@ class TrainingDisplay:
 def results_table(results: dict[str, Any], seeds: list[int], title: str) -> Table:
     """Returns of every seed, and over seeds mean and standard error, with sampled and with mode actions."""
     table = Table(title=title, title_justify="left")
-    with_success = results["sampled"]["success"] is not None
-    for heading in ("seed", "sampled actions", "mode actions", *(["success sampled", "success mode"] * with_success)):
+    modes = ("sampled", "mode")
+    measures = [name.removeprefix("seeds_") for name, of in results["sampled"].items() if name[:6] == "seeds_" and of]
+    headings = [f"{name} {mode}" for name in measures for mode in modes]
+    for heading in ("seed", "sampled actions", "mode actions", *headings):
         table.add_column(heading, justify="right")
     for index, seed in enumerate(seeds):
-        returns = [results[mode]["seeds"][index] for mode in ("sampled", "mode")]
+        returns = [results[mode]["seeds"][index] for mode in modes]
         cells = ["diverged" if mean is None else f"{mean:.1f}" for mean in returns]
-        if with_success:
-            cells += [f"{results[mode]['seeds_success'][index]:.0%}" for mode in ("sampled", "mode")]
+        cells += [measure_text(name, results[mode][f"seeds_{name}"][index]) for name in measures for mode in modes]
         table.add_row(str(seed), *cells)
     table.add_section()
-    cells = [_mean(results[mode]) for mode in ("sampled", "mode")]
-    if with_success:
-        cells += [f"{results[mode]['success']:.0%}" for mode in ("sampled", "mode")]
+    cells = [_mean(results[mode]) for mode in modes]
+    cells += [measure_text(name, results[mode][name]) for name in measures for mode in modes]
     table.add_row("mean ± S.E.M.", *cells)
     return table
 

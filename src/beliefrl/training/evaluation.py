@@ -25,12 +25,12 @@ from beliefrl.types import LARGEST, UserError, one_line, tuples
 MODES = ("sampled", "mode")  # how actions are chosen; the axis of an evaluation's leaves after that of seeds
 
 
-def summary(result: Episode, has_success: bool) -> dict[str, Any]:
-    """Per mode: every seed's mean return, their mean, its standard error over seeds (None with one), and success.
+def summary(result: Episode) -> dict[str, Any]:
+    """Per mode: every seed's mean return, their mean, its standard error over seeds (None with one), and the measures.
 
     Leaves of `result` are (seed, mode, episodes).
     """
-    returns, success = np.asarray(result.episode_return), np.asarray(result.success)
+    returns = np.asarray(result.episode_return)
     table = {}
     for index, mode in enumerate(MODES):
         seeds = returns[:, index].mean(axis=-1)
@@ -39,9 +39,13 @@ def summary(result: Episode, has_success: bool) -> dict[str, Any]:
             "mean": float(finite.mean()),
             "sem": float(finite.std(ddof=1) / np.sqrt(finite.size)) if finite.size > 1 else None,
             "seeds": [float(mean) if np.isfinite(mean) else None for mean in seeds],
-            "success": float(success[:, index].mean()) if has_success else None,
-            "seeds_success": [float(rate) for rate in success[:, index].mean(axis=-1)] if has_success else None,
+            "success": None,
+            "seeds_success": None,
         }
+        for name, values in result.measures.items():
+            of_seeds = np.asarray(values)[:, index].mean(axis=-1)
+            table[mode][name] = float(np.nanmean(of_seeds))
+            table[mode][f"seeds_{name}"] = [float(mean) if np.isfinite(mean) else None for mean in of_seeds]
     return table
 
 
@@ -164,7 +168,8 @@ def evaluate(
 
     Returns:
         {"episodes", "sampled": {"mean", "sem", "seeds", "success", "seeds_success"}, "mode": the same}. Returns are
-        undiscounted; "sem" is over seeds and None with one; success is a rate in [0, 1], None where a task has none.
+        undiscounted; "sem" is over seeds and None with one. "success" is a rate in [0, 1], None if the task does not
+        define success. Other measures of the task, such as "distance", stand beside it with "seeds_distance".
 
     Raises:
         UserError: there is no such run, nothing was saved in it, or a number is impossible.
@@ -183,7 +188,7 @@ def evaluate(
         else:
             compiled = jax.jit(jax.vmap(lambda state, key: evaluate_seed(trained, found, state, key, episodes)))
             result = jax.block_until_ready(compiled(states, keys))
-    return {"episodes": episodes} | summary(result, found.spec.has_success)
+    return {"episodes": episodes} | summary(result)
 
 
 def _showing(progress: bool, episodes: int) -> contextlib.AbstractContextManager[Callable[[int], None]]:

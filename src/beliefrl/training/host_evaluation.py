@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from beliefrl.agents import Agent
 from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.training import rollout
 from beliefrl.training.lockstep import Lockstep, environment_seeds
 from beliefrl.training.rollout import Episode
 from beliefrl.types import Spec, Timestep
@@ -54,15 +55,16 @@ class Evaluation:
         step = Timestep(obs, never.astype(np.float32), action, ~never, never)
         empty = self.agent.reset(self.task.spec)
         memory = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*keys.shape, *leaf.shape)), empty)
-        record, returns, length = _Record(lanes, episodes), np.zeros(lanes), np.zeros(lanes, int)
+        record, returns, length = _Record(self.task.spec, lanes, episodes), np.zeros(lanes), np.zeros(lanes, int)
         explore, time = np.array([True, False]), 0
         while not record.full:
             perceived = jax.tree.map(lambda leaf: leaf.reshape(*keys.shape, *leaf.shape[1:]), step)
             action, memory = self._perceive(states, memory, perceived, keys, explore, time)
             action = np.asarray(action).reshape(lanes, -1)
-            obs, reward, terminated, truncated, success = self.environments.step(action)
+            obs, reward, terminated, truncated, measures = self.environments.step(action)
             returns, length, done, time = returns + reward, length + 1, terminated | truncated, time + 1
-            record.add(done, returns, length, success)
+            now: Any = done, returns, length, measures
+            record.add(Episode(*now))
             if done.any():
                 obs = self.environments.restart(done)
                 returns, length = np.where(done, 0.0, returns), np.where(done, 0, length)
@@ -94,10 +96,8 @@ def _perceive(
 class _Record:
     """The first episodes of every lane."""
 
-    def __init__(self, lanes: int, episodes: int):
-        shape = (lanes, episodes)
-        columns: Any = [np.zeros(shape, kind) for kind in (bool, np.float32, np.int32, bool)]
-        self.episodes = Episode(*columns)
+    def __init__(self, spec: Spec, lanes: int, episodes: int):
+        self.episodes: Any = jax.tree.map(np.array, rollout.no_episodes(spec, (lanes, episodes)))
         self.count = np.zeros(lanes, int)
 
     @property
@@ -105,9 +105,9 @@ class _Record:
         """Whether every lane has all its episodes."""
         return bool(self.episodes.done.all())
 
-    def add(self, done: Any, *values: Any) -> None:
-        """Add the episodes that are `done` and still wanted; values are Episode's other fields, leaves (lane,)."""
-        lanes = np.flatnonzero(done & (self.count < self.episodes.done.shape[1]))
-        for column, value in zip(self.episodes, (done, *values), strict=True):
+    def add(self, now: Episode) -> None:
+        """Add the episodes that are `done` and still wanted; leaves (lane,)."""
+        lanes = np.flatnonzero(now.done & (self.count < self.episodes.done.shape[1]))
+        for column, value in zip(*map(jax.tree.leaves, (self.episodes, now)), strict=True):
             column[lanes, self.count[lanes]] = value[lanes]
         self.count[lanes] += 1

@@ -92,7 +92,7 @@ class StepResult(NamedTuple):
     reward: Any  # (seed,)
     terminated: Any  # (seed,)
     done: Any  # (seed,)
-    success: Any  # (seed,)
+    measures: dict[str, Any]  # leaves (seed,)
     fresh: Any  # (seed, obs), the first observation of the next episode where done
 
 
@@ -161,7 +161,7 @@ class HostLoop:
             np.zeros(lanes, np.float32),
             np.zeros(lanes, bool),
         )
-        result = StepResult(output, obs, number, never, never, never, obs)
+        result = StepResult(output, obs, number, never, never, dict.fromkeys(self.spec.measures, number), obs)
         if isinstance(self._go_on, jax.stages.Wrapped) and (self.agent.cycle > 1 or not learns):
             rest = seeds._replace(state=())
             self._go_on = self._go_on.lower(self.agent.networks(seeds.state), rest, result, 0).compile()
@@ -171,13 +171,13 @@ class HostLoop:
     def _step(self, seeds: SeedState, output: ActorOutput, step: int, log: "_StretchLog") -> StepResult:
         """One step of every environment."""
         try:
-            obs, reward, terminated, truncated, success = self.environments.step(np.asarray(output.action))
+            obs, reward, terminated, truncated, measures = self.environments.step(np.asarray(output.action))
             done = terminated | truncated
             fresh = self.environments.restart(done) if done.any() else obs
         except Fault as fault:
             fault.seeds, fault.step, fault.stretch = seeds, step, log.stretch()
             raise
-        return StepResult(output, obs, reward, terminated, done, success, fresh)
+        return StepResult(output, obs, reward, terminated, done, measures, fresh)
 
 
 class _StretchLog:
@@ -213,7 +213,7 @@ def _record(
     after = rollout.arrive(seed.actor, memory, action, (), result.obs, result.reward, result.terminated)
     fresh = rollout.first(agent, spec, (), result.fresh)
     actor, replay = rollout.record(agent, seed.state, seed.replay, seed.actor, after, fresh, result.done, key_last)
-    episode = Episode(result.done, after.episode_return, after.length, result.success)
+    episode = Episode(result.done, after.episode_return, after.length, result.measures)
     return seed._replace(actor=actor, replay=replay), episode
 
 

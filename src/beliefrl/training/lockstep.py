@@ -33,7 +33,7 @@ class StepResults(NamedTuple):
     reward: Any  # (lane,) float32
     terminated: Any  # (lane,) bool
     truncated: Any  # (lane,) bool
-    success: Any  # (lane,) bool
+    measures: dict[str, Any]  # leaves (lane,) float32
 
 
 class _Call(NamedTuple):
@@ -98,7 +98,8 @@ class Lockstep:
                 obs, reward, terminated, truncated, info = self._envs.step_wait(self.timeout)
             else:
                 obs, reward, terminated, truncated, info = self._envs.step(actions)
-        return StepResults(obs, reward.astype(np.float32), terminated, truncated, np.asarray(info["success"], bool))
+        measures = {name: np.asarray(info[name], np.float32) for name in self.task.spec.measures}
+        return StepResults(obs, reward.astype(np.float32), terminated, truncated, measures)
 
     def restart(self, done: Bool[np.ndarray, " lane"]) -> Any:
         """Begin an episode where `done`; returns the observations of all environments, (lane, obs)."""

@@ -27,13 +27,18 @@ def finite(states: Any) -> Bool[Array, " seed"]:
 
 
 def without(evaluation: Episode, lost: Collection[int]) -> Episode:
-    """The same evaluation with NaN as the returns of the `lost` seeds (indices)."""
-    returns: Any = np.array(evaluation.episode_return)
-    returns[sorted(lost)] = np.nan
-    return evaluation._replace(episode_return=returns)
+    """The same evaluation with NaN as the returns and measures of the `lost` seeds (indices)."""
+
+    def blank(leaf: Any) -> Any:
+        leaf = np.array(leaf)
+        leaf[sorted(lost)] = np.nan
+        return leaf
+
+    measures = jax.tree.map(blank, evaluation.measures)
+    return evaluation._replace(episode_return=blank(evaluation.episode_return), measures=measures)
 
 
-def record(recorder: Recorder, event: Event, has_success: bool, lost: Collection[int]) -> dict[str, Any] | None:
+def record(recorder: Recorder, event: Event, lost: Collection[int]) -> dict[str, Any] | None:
     """Log an event for every seed that is not lost; returns the summary of an evaluation."""
     metrics = {name: np.asarray(values) for name, values in event.metrics.items()}
     for index, seed in enumerate(recorder.seeds):
@@ -46,10 +51,10 @@ def record(recorder: Recorder, event: Event, has_success: bool, lost: Collection
         if event.episodes is not None:
             episodes = jax.tree.map(lambda leaf, index=index: np.asarray(leaf[index]), event.episodes)
             for end in np.flatnonzero(episodes.done):
-                recorder.log(seed, "episode", event.step, _episode(episodes, end, has_success))
+                recorder.log(seed, "episode", event.step, _episode(episodes, end))
         if event.evaluation is not None:
             result = jax.tree.map(lambda leaf, index=index: np.asarray(leaf[index]), event.evaluation)
-            recorder.log(seed, "evaluation", event.step, _evaluated(result, has_success))
+            recorder.log(seed, "evaluation", event.step, _evaluated(result))
     if event.states is not None:
         recorder.flush()
         recorder.save(event.states, lost)
@@ -58,7 +63,7 @@ def record(recorder: Recorder, event: Event, has_success: bool, lost: Collection
     if event.states is not None:
         returns = np.asarray(event.evaluation.episode_return)[:, MODES.index("sampled")].mean(axis=-1).tolist()
         best.save(recorder.folder, event.states, event.step, returns)
-    return {"step": event.step} | summary(event.evaluation, has_success)
+    return {"step": event.step} | summary(event.evaluation)
 
 
 def _row(metrics: dict[str, np.ndarray], index: int) -> dict[str, float]:
@@ -66,15 +71,14 @@ def _row(metrics: dict[str, np.ndarray], index: int) -> dict[str, float]:
     return {name: float(values[index]) for name, values in metrics.items() if np.isfinite(values[index])}
 
 
-def _episode(episodes: Episode, end: Any, has_success: bool) -> dict[str, Any]:
-    success = {"success": bool(episodes.success[end])} if has_success else {}
-    return {"return": float(episodes.episode_return[end]), "length": int(episodes.length[end])} | success
+def _episode(episodes: Episode, end: Any) -> dict[str, Any]:
+    measures = {name: float(values[end]) for name, values in episodes.measures.items()}
+    return {"return": float(episodes.episode_return[end]), "length": int(episodes.length[end])} | measures
 
 
-def _evaluated(result: Episode, has_success: bool) -> dict[str, Any]:
+def _evaluated(result: Episode) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for index, mode in enumerate(MODES):
         values[mode] = [float(value) for value in result.episode_return[index]]
-        if has_success:
-            values[f"{mode}_success"] = [bool(success) for success in result.success[index]]
+        values |= {f"{mode}_{name}": list(map(float, column[index])) for name, column in result.measures.items()}
     return values

@@ -67,12 +67,6 @@ def seed_of(
     return SeedState(state, actor, ring.init(rollout.stored(agent, actor), capacity), key)
 
 
-def _no_episodes(agent: Agent, seeds: SeedState) -> Episode:
-    shape = len(seeds.key), stretch_length(agent)
-    none = jnp.zeros(shape, bool)
-    return Episode(none, jnp.zeros(shape), jnp.zeros(shape, int), none)
-
-
 def _write(log: Episode, index: Int[Array, ""], episode: Episode) -> Episode:
     return jax.tree.map(lambda column, entry: column.at[index].set(entry), log, episode)
 
@@ -93,7 +87,8 @@ def explore(
         seeds, log = carry
         return jax.vmap(partial(_act, agent, task), in_axes=(0, 0, None, None))(seeds, log, first + i, i)
 
-    seeds, log = jax.lax.fori_loop(0, steps, step, (seeds, _no_episodes(agent, seeds)))
+    none = rollout.no_episodes(task.spec, (len(seeds.key), stretch_length(agent)))
+    seeds, log = jax.lax.fori_loop(0, steps, step, (seeds, none))
     return seeds, Stretch({}, log)
 
 
@@ -147,7 +142,7 @@ def learn(
     """`cycles` cycles of learning from environment step `first` on; at most `stretch_length` steps in all."""
     # Traced once, for its shapes and for the loop.
     one_cycle = jax.jit(jax.vmap(partial(_cycle, agent, task), in_axes=(0, 0, None, None)), inline=True)
-    none = _no_episodes(agent, seeds)
+    none = rollout.no_episodes(task.spec, (len(seeds.key), stretch_length(agent)))
     shapes = jax.eval_shape(one_cycle, seeds, none, first, first)[2]
 
     def step(i, carry):

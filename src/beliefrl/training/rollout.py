@@ -21,7 +21,7 @@ from beliefrl.agents import Agent
 from beliefrl.tasks import Task
 from beliefrl.training import replay as ring
 from beliefrl.training.replay import Replay
-from beliefrl.types import Spec, StoredTimestep, Timestep
+from beliefrl.types import Spec, StoredTimestep, Timestep, UserError
 
 
 class ActorState(NamedTuple):
@@ -34,13 +34,37 @@ class ActorState(NamedTuple):
     episode_return: Float[Array, ""]  # undiscounted, so far
 
 
+TAKEN = {"step", "kind", "return", "length"}  # entries of an episode in the log
+
+
 class Episode(NamedTuple):
     """What an environment step reports of its episode; the other fields count only where `done`."""
 
     done: Bool[Array, "*batch"]
     episode_return: Float[Array, "*batch"]  # undiscounted
     length: Int[Array, "*batch"]
-    success: Bool[Array, "*batch"]
+    measures: dict[str, Float[Array, "*batch"]]  # by name, as `Spec.measures`
+
+
+def no_episodes(spec: Spec, shape: tuple[int, ...]) -> Episode:
+    """Of a shape, with nothing in them."""
+    number = jnp.zeros(shape)
+    return Episode(number.astype(bool), number, number.astype(int), dict.fromkeys(spec.measures, number))
+
+
+def measured(task: Task, task_state: Any) -> dict[str, Float[Array, ""]]:
+    """The measures of a task at a state.
+
+    Raises:
+        UserError: the task does not return what its `spec.measures` names.
+    """
+    names, kind = task.spec.measures, type(task).__name__
+    found: Any = task.measures(task_state) if names else {}  # pyright: ignore[reportAttributeAccessIssue]
+    if set(found) != set(names):
+        raise UserError(f"{kind}.measures returns {sorted(found)}: its spec names {sorted(names)}, so return these.")
+    if taken := TAKEN & set(names):
+        raise UserError(f"{kind} has a measure {min(taken)!r}, which every episode has: choose another name.")
+    return {name: jnp.asarray(found[name], float) for name in names}
 
 
 def strong(tree: Any) -> Any:
@@ -107,7 +131,7 @@ def move(
     task_state, obs, reward, terminated = task.step(actor.task_state, action, key_task)
     after = arrive(actor, memory, action, task_state, obs, reward, terminated)
     done = terminated | (after.length >= task.spec.max_steps)
-    return after, Episode(done, after.episode_return, after.length, task.success(task_state))
+    return after, Episode(done, after.episode_return, after.length, measured(task, task_state))
 
 
 def record(
@@ -168,8 +192,7 @@ def evaluate(agent: Agent, task: Task, state: Any, key: Key[Array, ""], explore:
     key_reset, key_steps = jax.random.split(key)
     episodes = explore.shape[0]
     actors = jax.vmap(lambda key: begin(agent, task, key))(jax.random.split(key_reset, episodes))
-    none = jnp.zeros(episodes, bool)
-    result = Episode(none, jnp.zeros(episodes), jnp.zeros(episodes, int), none)
+    result = no_episodes(task.spec, (episodes,))
 
     def step(carry):
         time, actors, result = carry

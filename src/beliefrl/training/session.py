@@ -49,7 +49,6 @@ class Session:
         self.recorder, self.agent, self.task, self.options = recorder, agent, task, options
         self.own_process = own_process
         self.callback = callback
-        self.has_success = task.spec.has_success
         self.checkpoints = Checkpoints(recorder.folder, options.keep_checkpoints)
         self.given = "initial" in recorder.config  # whether the first networks come from another run
         self.last, self.saved_at = TrainingProgress(refreshed=self.given), time.monotonic()
@@ -137,7 +136,7 @@ class Session:
             event = event._replace(evaluation=log.without(event.evaluation, self.lost))
         if event.states is not None:
             event = event._replace(states=self.agent.networks(event.states))
-        self.results = log.record(self.recorder, event, self.has_success, self.lost) or self.results
+        self.results = log.record(self.recorder, event, self.lost) or self.results
         if event.evaluation is not None:
             self.ended = self._reached(event.step)
         self._report(event)

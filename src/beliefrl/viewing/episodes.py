@@ -14,9 +14,10 @@ import jax
 import numpy as np
 
 from beliefrl.agents import Agent
+from beliefrl.analysis.tables import measure_text
 from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
-from beliefrl.tasks.gymnasium import GymnasiumTask, success_of
+from beliefrl.tasks.gymnasium import GymnasiumTask, measure_of
 from beliefrl.training.evaluation import restore_seed
 from beliefrl.types import LARGEST, Timestep, UserError
 from beliefrl.viewing import rendering
@@ -28,8 +29,14 @@ class Trajectory(NamedTuple):
 
     steps: Timestep  # numpy, leaves (time, ...); prev_action[t] led to reward[t] and obs[t]
     total: float  # undiscounted return
-    success: bool | None  # whether it succeeded; None if the task does not define success
+    measures: dict[str, float | None]  # of the task, such as "success"; None if its last step did not report it
     frames: dict[int, Pixels]  # the requested frames, by timestep
+
+    @property
+    def summary(self) -> str:
+        """The return and the measures as text."""
+        texts = [f"{name} {measure_text(name, value)}" for name, value in self.measures.items() if value is not None]
+        return ", ".join([f"return {self.total:.1f}", *texts])
 
 
 class Frame(NamedTuple):
@@ -88,7 +95,7 @@ class Player:
         limit = min(steps or LARGEST, spec.max_steps)
         obs, _ = self.environment.reset(seed=seed)
         played = [_timestep(obs, 0.0, np.zeros(spec.action_dim), is_first=True)]
-        memory, total, done, success = self.agent.reset(spec), 0.0, False, False
+        memory, total, done, info = self.agent.reset(spec), 0.0, False, {}
         while True:
             time = len(played) - 1
             done = done or time >= limit
@@ -101,10 +108,11 @@ class Player:
                 break
             action, memory = self._act(self._state, memory, played[-1], key, time, sampled)
             obs, reward, terminated, truncated, info = self.environment.step(np.asarray(action))
-            total, done, success = total + reward, terminated or truncated, success_of(info)
+            total, done = total + reward, terminated or truncated
             played.append(_timestep(obs, reward, action, terminated=terminated))
         steps_played = jax.tree.map(lambda *leaves: np.stack(leaves), *played)
-        return Trajectory(steps_played, total, success if spec.has_success else None, frames)
+        measures = {name: measure_of(info, name) for name in spec.measures}
+        return Trajectory(steps_played, total, measures, frames)
 
 
 def _timestep(obs: Any, reward: float, action: Any, is_first: bool = False, terminated: bool = False) -> Timestep:

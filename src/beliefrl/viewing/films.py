@@ -254,8 +254,7 @@ def _draw_strips(runs: Sequence[Run], rows: Sequence[Trajectory]) -> Any:
     height = sum(side * ratio + above + below for ratio in ratios)
     figure, top = figures.figure(width, height, layout=None), height
     for run, row, ratio in zip(runs, rows, ratios, strict=True):
-        reached = {None: "", True: ", success", False: ", no success"}[row.success]
-        title = f"{run.config['agent']} on {run.config['task']}, return {row.total:.1f}{reached}"
+        title = f"{run.config['agent']} on {run.config['task']}, {row.summary}"
         figure.text(gap / width, (top - 0.2) / height, title, fontsize=9)
         low = top - above - side * ratio
         for index, (time, pixels) in enumerate(row.frames.items()):
