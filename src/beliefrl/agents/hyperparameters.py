@@ -7,7 +7,7 @@ import dataclasses
 import difflib
 import functools
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from beliefrl.imports import path
@@ -23,16 +23,16 @@ class Range:
     An agent has a class attribute `ranges`: for each hyperparameter that is tuned a Range, or a tuple of values.
     """
 
-    low: float
+    low: int | float
     """The lowest number."""
-    high: float
+    high: int | float
     """The highest number."""
     scale: Scale | None = None
     """What is drawn uniformly: linear, the number; log, its logarithm; horizon, log(1 - number), as for a discount
     factor γ, whose horizon is 1 / (1 - γ). None: the scale of the agent's own range, otherwise linear."""
 
 
-Ranges = Mapping[str, Range | tuple[Any, ...]]
+Ranges = Mapping[str, Range | Sequence[Any]]
 
 
 def build(agent: Any, hyperparameters: Mapping[str, Any], name: str | None = None) -> Any:

@@ -77,10 +77,8 @@ def tune(argv: Sequence[str]) -> None:
     console = Console()
     console.print(_table(tuned))
     folder = tuned.study.parent
-    print(
-        f"drawn in {folder}: history.png and importance.png; `beliefrl report {folder} --unfinished` shows all trials"
-    )
-    print("the best settings with new seeds:\n")
+    print(f"{folder} has history.png and importance.png; `beliefrl report {folder} --unfinished` shows the trials")
+    print("this trains the best settings with new seeds:\n")
     print(tuned.command)  # one line, to be copied
 
 
@@ -112,7 +110,7 @@ def _table(tuned: Any) -> Any:
 
     states = [trial.state for trial in tuned.trials]
     counts = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states))
-    table = Table(title=Text(f"{tuned.study.parent}: {len(states)} trials, {counts}"), title_justify="left")
+    table = Table(title=f"{len(states)} trials, {counts}", title_justify="left")
     for heading in ("trial", "objective", "settings"):
         table.add_column(heading, justify="right" if heading == "objective" else "left")
     for trial in tuned.trials[: states.count("complete")][:SHOWN]:

@@ -3,7 +3,7 @@
 import json
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol, get_args
+from typing import Any, Protocol, get_args, runtime_checkable
 
 from beliefrl.agents import hyperparameters
 from beliefrl.agents.hyperparameters import Range, Ranges, Scale
@@ -13,6 +13,7 @@ DIGITS = 4  # significant digits of a drawn number, so that settings can be read
 ENDS = re.compile(r"(?P<low>[^:]+)\.\.(?P<high>[^:]+?)(:(?P<scale>.*))?")
 
 
+@runtime_checkable
 class Drawing(Protocol):
     """The methods of an Optuna trial that are used here."""
 
@@ -76,7 +77,7 @@ def chosen(agent: Any, name: str, given: Ranges, only: Sequence[str] = (), fixed
     return {each: _checked(agent, name, each, values, own.get(each)) for each, values in tuned.items()}
 
 
-def _checked(agent: Any, agent_name: str, name: str, values: Any, own: Any) -> Range | tuple[Any, ...]:
+def _checked(agent: Any, agent_name: str, name: str, values: Any, own: Any) -> Range | Sequence[Any]:
     """A range with its scale, after a check of its ends; or the values to choose from."""
     if not isinstance(values, Range):
         choices = tuples({name: list(values)})[name] if isinstance(values, list | tuple) else ()
@@ -120,7 +121,7 @@ def draw(trial: Drawing, ranges: Ranges) -> dict[str, Any]:
     return {name: _drawn(trial, name, values) for name, values in ranges.items()}
 
 
-def _drawn(trial: Drawing, name: str, values: Range | tuple[Any, ...]) -> Any:
+def _drawn(trial: Drawing, name: str, values: Range | Sequence[Any]) -> Any:
     if not isinstance(values, Range):
         texts = {json.dumps(value): value for value in values}
         return texts[trial.suggest_categorical(name, list(texts))]
@@ -138,7 +139,7 @@ def _rounded(number: float) -> float:
     return float(f"{number:.{DIGITS}g}")
 
 
-def _parameter(name: str, values: Range | tuple[Any, ...]) -> str:
+def _parameter(name: str, values: Range | Sequence[Any]) -> str:
     """The name of Optuna's parameter for a hyperparameter: with the scale horizon it is what 1 lacks."""
     return f"1-{name}" if isinstance(values, Range) and values.scale == "horizon" else name
 

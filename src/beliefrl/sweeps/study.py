@@ -220,6 +220,7 @@ def draw(study: Any, folder: pathlib.Path) -> list[pathlib.Path]:
         for name, plot in (("history", plots.plot_optimization_history), ("importance", plots.plot_param_importances)):
             if len(values) >= (1 if name == "history" else 2):
                 figure: Any = plot(study, target_name="objective").figure
+                figure.tight_layout()  # its labels may be long
                 drawn.append(figures.save(figure, folder / f"{name}.png"))
                 pyplot.close(figure)
     return drawn

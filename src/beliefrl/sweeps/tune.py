@@ -255,7 +255,7 @@ class _Loop:
             elif code == 0 and returns:
                 value = self.search.value(returns)
                 self.study.tell(trial, value)
-                self.status.notes[name] = f"{self.search.objective} return {value:.1f}"
+                self.status.notes[name] = f"objective {value:.1f}"
                 self.status.finished.append(training)
             elif code in STOPPED:  # it continues in the next session
                 self.status.waiting.append(training)
