@@ -237,6 +237,18 @@ def test_a_study_of_something_else_is_not_continued(search, tmp_path):
         search(2)
 
 
+def test_a_full_disk_is_one_sentence_and_the_search_goes_on_later(search, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(study, "draw", full)
+        with pytest.raises(UserError, match=r"search cannot be written \(No space left on device\): fix that"):
+            search(1)
+    assert len(search(1).trials) == 1
+    assert len(Fake.started) == 1
+
+
 def test_without_optuna_the_extra_is_named(search, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "optuna", None)
     with pytest.raises(UserError, match=r"tune needs Optuna: pip install 'beliefrl\[tune\]'"):

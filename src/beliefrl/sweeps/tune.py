@@ -104,6 +104,18 @@ def tune(
     study.optuna()  # raises an error if it is not installed
     folder = pathlib.Path(out or pathlib.Path("runs") / re.sub(r"[^\w.-]+", "-", f"tune-{agent}-{task}"))
     _check_folder(folder)
+    try:
+        return _run(folder, search, trials, prune, workers, progress)
+    except BrokenPipeError:  # the reader of the output has closed it
+        raise
+    except OSError as error:
+        raise UserError(
+            f"{folder} cannot be written ({error.strerror}): fix that, then the same command continues."
+        ) from None
+
+
+def _run(folder: pathlib.Path, search: Search, trials: int, prune: bool, workers: int | None, progress: bool) -> Tuned:
+    """Run the trials that are missing."""
     with lock(folder), study.quiet():
         recorded = study.open_study(folder, search, prune)
         stopped = study.running(recorded)
