@@ -135,7 +135,9 @@ def test_lists_and_help_import_nothing_slow(line):
     assert imported(f"from beliefrl import cli; cli.main({line.split()})") == []
 
 
-@pytest.mark.parametrize("line", ["tasks --all", "show --all", "evaluate --help", "train --help", "train vmr pendulum"])
+@pytest.mark.parametrize(
+    "line", ["tasks --all", "show --all", "evaluate --help", "train --help", "tune --help", "tune vmr pendulum"]
+)
 def test_options_are_checked_without_jax(line):
     assert imported(f"from beliefrl import cli; cli.main({line.split()})") == ["tyro"]
 

@@ -16,6 +16,7 @@ from beliefrl.registration import register_when_imported
 if TYPE_CHECKING:
     from beliefrl.agents import Agent
     from beliefrl.agents import make as make_agent
+    from beliefrl.agents.hyperparameters import Range
     from beliefrl.analysis.curves import draw_curve
     from beliefrl.policy import Policy, load
     from beliefrl.report import write_report
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from beliefrl.runs.run import Run
     from beliefrl.sweeps.plan import Experiment, grid
     from beliefrl.sweeps.run import SweepStatus, sweep
+    from beliefrl.sweeps.tune import Tuned, tune
     from beliefrl.tasks import Task, observe, with_faults
     from beliefrl.tasks import make as make_task
     from beliefrl.tasks.check import TaskCheck, check
@@ -49,6 +51,7 @@ __all__ = [
     "Options",
     "Policy",
     "Predictions",
+    "Range",
     "Run",
     "Spec",
     "Stopped",
@@ -59,6 +62,7 @@ __all__ = [
     "TaskEnvironment",
     "Timestep",
     "Trajectory",
+    "Tuned",
     "UserError",
     "Window",
     "WindowShape",
@@ -78,6 +82,7 @@ __all__ = [
     "sweep",
     "task_of",
     "train",
+    "tune",
     "video",
     "with_faults",
     "write_report",
@@ -93,6 +98,7 @@ _HOMES = {
     "Options": "runs.options:Options",
     "Policy": "policy:Policy",
     "Predictions": "viewing.prediction:Predictions",
+    "Range": "agents.hyperparameters:Range",
     "Run": "runs.run:Run",
     "Spec": "types:Spec",
     "Stopped": "training.stop:Stopped",
@@ -103,6 +109,7 @@ _HOMES = {
     "TaskEnvironment": "tasks.environment:TaskEnvironment",
     "Timestep": "types:Timestep",
     "Trajectory": "viewing.episodes:Trajectory",
+    "Tuned": "sweeps.tune:Tuned",
     "UserError": "types:UserError",
     "Window": "types:Window",
     "WindowShape": "types:WindowShape",
@@ -122,6 +129,7 @@ _HOMES = {
     "sweep": "sweeps.run:sweep",
     "task_of": "training.evaluation:task_of",
     "train": "training.train:train",
+    "tune": "sweeps.tune:tune",
     "video": "viewing.films:video",
     "with_faults": "tasks:with_faults",
     "write_report": "report:write_report",

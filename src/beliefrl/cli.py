@@ -15,6 +15,7 @@ Reinforcement learning for agents that do not see the whole state.
   beliefrl train AGENT TASK     train, with a live view, into a run's folder
   beliefrl resume RUN           go on with a training that was stopped or killed, or train it longer
   beliefrl sweep --preset NAME  many trainings: agents x tasks x settings x seeds, on all cores or a Ray cluster
+  beliefrl tune AGENT TASK      search for good hyperparameters with Optuna, in many trainings
   beliefrl figure KIND RUNS     the paper's figures and tables from finished runs: curves, ablation, elbo, ...
   beliefrl show RUN             what a run was made with, how far it is, and what it is worth
   beliefrl evaluate RUN         play new episodes with what a run has learned

@@ -211,3 +211,14 @@ def test_what_a_training_does_is_read_off_its_last_lines(tmp_path):
     log.write_text(json.dumps({"step": 30, "kind": "evaluation", "sampled": [1.0, 2.0], "mode": [0.0]}) + "\n")
     forecast.watch(status)
     assert (progress.step, progress.last_return) == (30, 1.5)
+
+
+def test_one_training_can_be_stopped_alone(tmp_path):
+    launcher = local.Local(tmp_path, [])
+    programs = {name: subprocess.Popen(["sleep", "60"]) for name in ("one", "other")}
+    for name, program in programs.items():
+        launcher._running[name] = program, "any", (tmp_path / name).open("wb")
+    launcher.interrupt("one")
+    programs["one"].wait(timeout=30)
+    assert launcher.ended() == {"one": -signal.SIGTERM}
+    launcher.stop()

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
+from beliefrl.agents.hyperparameters import Range
 from beliefrl.models.nets import RunningStatistics, standardise, tanh_gaussian, update_statistics
 from beliefrl.models.returns import transition_batch
 from beliefrl.models.soft_actor_critic import (
@@ -54,6 +55,17 @@ class ControllerAgent:
     """Hidden layers of Q and V (Table 1)."""
     actor_regulariser: float = 1e-3
     """Weight of half the mean squares of the policy's μ and σ in the actor's loss (the authors' code; 0 is off)."""
+
+    ranges = {  # for `beliefrl.tune`
+        "gamma": Range(0.95, 0.999, "horizon"),
+        "n_step": (1, 3, 5, 10),
+        "lr_actor": Range(1e-4, 3e-3, "log"),
+        "lr_critic": Range(1e-4, 3e-3, "log"),
+        "lr_alpha": Range(1e-4, 3e-3, "log"),
+        "tau": Range(1e-3, 2e-2, "log"),
+        "policy_layers": ((64, 64), (128, 128), (256, 256)),
+        "value_layers": ((64, 64), (128, 128), (256, 256)),
+    }
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
@@ -125,6 +137,8 @@ class SACAgent(ControllerAgent):
     and each step takes longer."""
     value_start: float = 0.0
     """Initial output of V and Q, up to noise from the initial weights (the paper: 0), in units of the return."""
+
+    ranges = ControllerAgent.ranges | {"updates_per_step": (1, 2, 4)}
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""

@@ -1,14 +1,38 @@
-"""The hyperparameters of an agent, ours or a user's: set, recorded as JSON has them, and restored from that."""
+"""The hyperparameters of an agent, ours or a user's: set, recorded as JSON has them, and restored from that.
+
+A `Range` says which values `beliefrl.tune` tries.
+"""
 
 import dataclasses
 import difflib
 import functools
 import json
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
 
 from beliefrl.imports import path
 from beliefrl.types import UserError, said, tuples
+
+Scale = Literal["linear", "log", "horizon"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Range:
+    """The numbers from `low` to `high`, which `beliefrl.tune` tries for a hyperparameter.
+
+    An agent has a class attribute `ranges`: for each hyperparameter that is tuned a Range, or a tuple of values.
+    """
+
+    low: int | float
+    """The lowest number."""
+    high: int | float
+    """The highest number."""
+    scale: Scale | None = None
+    """What is drawn uniformly: linear, the number; log, its logarithm; horizon, log(1 - number), as for a discount
+    factor γ, whose horizon is 1 / (1 - γ). None: the scale of the agent's own range, otherwise linear."""
+
+
+Ranges = Mapping[str, Range | Sequence[Any]]
 
 
 def build(agent: Any, hyperparameters: Mapping[str, Any], name: str | None = None) -> Any:

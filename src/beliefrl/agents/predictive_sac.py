@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from beliefrl.agents.base import ControllerAgent, Metrics
+from beliefrl.agents.base import ControllerAgent, Metrics, Range
 from beliefrl.models import double_q
 from beliefrl.models.double_q import Controller
 from beliefrl.models.nets import (
@@ -114,6 +114,15 @@ class PredictiveSACAgent(ControllerAgent):
     """Steps over which the slowest of these cells forgets when training begins."""
     pool: int = 8
     """Cycles whose transitions the controller's batches are drawn from."""
+
+    ranges = ControllerAgent.ranges | {
+        "batch_size": (64, 128, 256, 512),
+        "lr_model": Range(1e-4, 3e-3, "log"),
+        "seq_len": (16, 32, 64),
+        "d_size": (64, 128, 256),
+        "long_memories": Range(0.0, 0.5),
+        "pool": (4, 8, 16),
+    }
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents.base import Metrics, SACAgent, for_each_update, split_updates
+from beliefrl.agents.base import Metrics, Range, SACAgent, for_each_update, split_updates
 from beliefrl.models.nets import LSTM, LSTMState, descend, draw
 from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState, soft_update, update
 from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range
@@ -52,6 +52,15 @@ class SACLSTMAgent(SACAgent):
     """Let the LSTM perceive the previous action beside the observation (the paper's does not)."""
     perceive_reward: bool = False
     """Let the LSTM perceive the previous reward beside the observation (the paper's does not)."""
+
+    ranges = SACAgent.ranges | {
+        "lr_lstm": Range(1e-4, 3e-3, "log"),
+        "seq_len": (16, 32, 64),
+        "batch_size": (4, 8, 16),
+        "d_size": (64, 128, 256),
+        "perceive_action": (False, True),
+        "perceive_reward": (False, True),
+    }
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""

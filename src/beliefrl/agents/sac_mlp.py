@@ -35,6 +35,8 @@ class SACMLPAgent(SACAgent):
     standardise: bool = False
     """Standardise the controller's observations to mean 0 and deviation 1, by running statistics."""
 
+    ranges = SACAgent.ranges | {"batch_size": (64, 128, 256, 512), "standardise": (False, True)}
+
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
         super().__post_init__()

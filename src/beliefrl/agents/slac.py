@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents.base import Metrics, SACAgent, split_updates
+from beliefrl.agents.base import Metrics, Range, SACAgent, split_updates
 from beliefrl.models.latent_model import LatentModel, Latents, elbo_terms, predict
 from beliefrl.models.nets import Gaussian, descend, draw
 from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean
@@ -58,6 +58,15 @@ class SLACAgent(SACAgent):
     """Updates of the model at step_start_rl, as many as VRM's pre-training has (Section 5; 0 is off)."""
     elbo_scaling: Literal["mean", "sum"] = "mean"
     """Mean (the authors' code) or sum (the formula) over the dimensions of z¹, and of observation and reward."""
+
+    ranges = SACAgent.ranges | {
+        "lr_model": Range(3e-5, 1e-3, "log"),
+        "seq_len": (8, 16),
+        "batch_size": (16, 32, 64),
+        "z1_size": (16, 32, 64),
+        "z2_size": (64, 128, 256),
+        "model_layers": ((64, 64), (128, 128), (256, 256)),
+    }
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents.base import Metrics, SACAgent, split_updates, standardise_beliefs
+from beliefrl.agents.base import Metrics, Range, SACAgent, split_updates, standardise_beliefs
 from beliefrl.models.nets import Gaussian, LSTMState, RunningStatistics, descend, draw, initial_statistics, standardise
 from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean
 from beliefrl.models.variational_model import VRM, elbo_terms, predict, prediction_error
@@ -91,6 +91,13 @@ class VRMAgent(SACAgent):
     """Form beliefs with a sample of z, as in training the models; if False, with the posterior's mean."""
     standardise: bool = False
     """Standardise the controller's beliefs to mean 0 and deviation 1, by running statistics."""
+
+    ranges = SACAgent.ranges | {
+        "lr_model": Range(2e-4, 2e-3, "log"),
+        "seq_len": (16, 32, 64),
+        "batch_size": (4, 8, 16),
+        "d_size": (64, 128, 256),
+    }
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""

@@ -8,6 +8,7 @@ COMMANDS: dict[str, str] = {  # module:function, imported when it is called
     "train": "training:train",
     "resume": "training:resume",
     "sweep": "sweep:sweep",
+    "tune": "tune:tune",
     "figure": "figure:figure",
     "show": "runs:show",
     "evaluate": "runs:evaluate",

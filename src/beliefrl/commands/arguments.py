@@ -100,6 +100,18 @@ def named_values(given: Sequence[str], option: str) -> dict[str, Any]:
     return values
 
 
+def value_lists(given: Sequence[str], option: str) -> dict[str, list[Any]]:
+    """{"name": [value, ...]} of NAME=VALUE,VALUE arguments. A list in brackets is one value: [64,64],[128,128]."""
+    lists = {}
+    for each in given:
+        name, separator, text = each.partition("=")
+        name = name.replace("-", "_")
+        named_values([name + separator + text], option)  # raises an error unless it is NAME=VALUE
+        parts = re.split(r",(?![^\[]*\])", text)
+        lists[name] = [named_values([f"value={part}"], option)["value"] for part in parts]
+    return lists
+
+
 WORDING = (  # message of tyro or Python: our message
     (r"Missing from .*: (\w+) .*", r"\1 is missing"),
     (r"Error parsing (\S+): (must be .*)", r"\1 \2"),

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from beliefrl.commands.arguments import UsageError, named_values, parse
+from beliefrl.commands.arguments import UsageError, named_values, parse, value_lists
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,7 +109,7 @@ def _only_continues(options: SweepOptions) -> bool:
 
 def _with_settings(experiments: list, options: SweepOptions) -> list:
     """The experiments with every combination of --set, and with --steps, --observe and --constants."""
-    given = {name: _values(value) for name, value in (_named(each) for each in options.set)}
+    given = value_lists(options.set, "--set")
     if options.steps is not None:
         given["steps"] = [options.steps]
     constants = named_values(options.constants, "--constants")
@@ -126,16 +126,3 @@ def _with_settings(experiments: list, options: SweepOptions) -> list:
                 )
             )
     return made
-
-
-def _named(given: str) -> tuple[str, str]:
-    name, separator, value = given.partition("=")
-    name = name.replace("-", "_")
-    named_values([name + separator + value], "--set")  # raises an error unless it is NAME=VALUE
-    return name, value
-
-
-def _values(text: str) -> list:
-    """The values in A,B,C. A list in brackets is one value."""
-    parts = [text] if text.startswith("[") else text.split(",")
-    return [named_values([f"value={part}"], "--set")["value"] for part in parts]

@@ -29,7 +29,8 @@ class SweepDisplay:
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self.screen.__exit__()
         if kind is None and self.before is not None:
-            done = f"{len(self.before.finished)} of {self.before.count} trainings finished in {self.folder}"
+            pruned = f" ({len(self.before.pruned)} pruned)" if self.before.pruned else ""
+            done = f"{len(self.before.finished)} of {self.before.count} trainings finished{pruned} in {self.folder}"
             self.screen.line(f"{done}; `beliefrl report {self.folder} -o report.html` shows them")
 
     def __call__(self, status: SweepStatus) -> None:
@@ -42,22 +43,27 @@ class SweepDisplay:
         if self.before is None:
             already = f", {len(status.finished)} of them finished already" if status.finished else ""
             self.screen.line(f"{status.count} trainings{already}, {len(status.running)} at a time")
-            self.before = SweepStatus([*status.finished], [])
+            self.before = SweepStatus([*status.finished], [], pruned=[*status.pruned])
         for name in status.running:
             if name not in self.before.running:
-                self.screen.line(f"begins: {name}")
+                self.screen.line(f"begins: {name}{_note(status, name)}")
         for training in status.finished[len(self.before.finished) :]:
-            self.screen.line(f"finished: {training.name} ({self._summary(status)})")
+            self.screen.line(f"finished: {training.name}{_note(status, training.name)} ({self._summary(status)})")
+        for training in status.pruned[len(self.before.pruned) :]:
+            self.screen.line(f"pruned: {training.name}{_note(status, training.name)} ({self._summary(status)})")
         for name, why in status.failed.items():
             if name not in self.before.failed:
                 self.screen.line(f"failed: {name}: {why}")
-        self.before = SweepStatus([*status.finished], [*status.waiting], dict(status.running), dict(status.failed))
+        self.before = SweepStatus(
+            [*status.finished], [*status.waiting], dict(status.running), dict(status.failed), [*status.pruned]
+        )
 
     def _summary(self, status: SweepStatus) -> str:
         failed = f", {len(status.failed)} failed" if status.failed else ""
+        pruned = f", {len(status.pruned)} pruned" if status.pruned else ""
         left = self.forecast.seconds_left(status)
         ends = "" if left is None else f", about {duration(left)} left"
-        return f"{len(status.finished)} of {status.count} done{failed}, {len(status.waiting)} waiting{ends}"
+        return f"{len(status.finished)} of {status.count} done{pruned}{failed}, {len(status.waiting)} waiting{ends}"
 
     def _table(self, status: SweepStatus) -> Group:
         table = Table(box=None, pad_edge=False)
@@ -67,3 +73,8 @@ class SweepDisplay:
             last = "" if progress.last_return is None else f"{progress.last_return:.1f}"
             table.add_row(name, f"{progress.step:,}/{progress.training.steps:,}", progress.doing, last)
         return Group(table, Text(self.screen.stamped(self._summary(status))))
+
+
+def _note(status: SweepStatus, name: str) -> str:
+    """What to add to a line about a training."""
+    return f": {status.notes[name]}" if name in status.notes else ""

@@ -51,6 +51,10 @@ class Local:
             self.free.append(slot)
         return codes
 
+    def interrupt(self, name: str) -> None:
+        """Ask one training to write a checkpoint and stop."""
+        self._running[name][0].send_signal(signal.SIGTERM)
+
     def stop(self) -> None:
         """Ask every training to write a checkpoint and stop, and wait for them."""
         for process, *_ in self._running.values():

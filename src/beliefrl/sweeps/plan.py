@@ -121,7 +121,7 @@ def grid(
 def shrunk(experiment: Experiment, scale: float) -> Experiment:
     """A copy with all step counts scaled: training, exploration, pre-training, and the interval of evaluations."""
     hyperparameters, options, _ = _split(experiment.settings)
-    agent: Any = _agent(experiment.agent, hyperparameters)
+    agent: Any = agent_of(experiment.agent, hyperparameters)
     counts = {name: value for name, value in dataclasses.asdict(agent).items() if name in SHRINKS}
     counts |= {name: options.get(name, getattr(Options, name)) for name in ("steps", "eval_every")}
     smaller = {name: max(10, round(count * scale)) if count else 0 for name, count in counts.items()}
@@ -238,7 +238,7 @@ def _check(trainings: Iterable[Training]) -> None:
     """Raise a UserError for any invalid training, before the first one starts."""
     specs: dict[str, Any] = {}
     for training in trainings:
-        agent = _agent(training.agent, training.settings)
+        agent = agent_of(training.agent, training.settings)
         capacity(agent, Options(**_typed(training.options, Options)))
         task = [training.task, training.observe or None, training.faults, training.constants]
         key = json.dumps(task, sort_keys=True, default=str)
@@ -246,7 +246,8 @@ def _check(trainings: Iterable[Training]) -> None:
             specs[key] = tasks.make(*task[:3], **training.constants).spec
 
 
-def _agent(name: str, hyperparameters: dict[str, Any]) -> Any:
+def agent_of(name: str, hyperparameters: dict[str, Any]) -> Any:
+    """The agent of that name with hyperparameters as JSON has them."""
     return agents.make(name, **_typed(hyperparameters, agents.find(name)))
 
 

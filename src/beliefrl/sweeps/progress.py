@@ -20,16 +20,18 @@ class Pace(NamedTuple):
 
 @dataclasses.dataclass
 class SweepStatus:
-    """The state of a sweep: each training is finished, waiting, running or failed."""
+    """The state of a sweep: each training is finished, waiting, running, failed, or pruned (`beliefrl.tune`)."""
 
     finished: list[Training]
     waiting: list[Training]
     running: dict[str, Training] = dataclasses.field(default_factory=dict)
     failed: dict[str, str] = dataclasses.field(default_factory=dict)  # name: the last error message of the training
+    pruned: list[Training] = dataclasses.field(default_factory=list)
+    notes: dict[str, str] = dataclasses.field(default_factory=dict)  # name: what the display adds to its lines
 
     @property
     def count(self) -> int:
-        return len(self.finished) + len(self.waiting) + len(self.running) + len(self.failed)
+        return len(self.finished) + len(self.waiting) + len(self.running) + len(self.failed) + len(self.pruned)
 
 
 class SweepProgress:

@@ -62,7 +62,7 @@ def sweep(
     """
     folder = pathlib.Path(out)
     plans.plan(experiments)  # raise errors before a folder is made
-    with _lock(folder):
+    with lock(folder):
         before = files.read(folder)
         _check_named(folder, before, experiments)
         slots = [] if ray else ["-"] if workers == 0 else local.slots(workers)
@@ -70,7 +70,7 @@ def sweep(
         on_gpu = launcher.has_gpus if isinstance(launcher, cluster.Cluster) else slots[0].startswith("gpu")
         together = seeds_per_run or (ALL if on_gpu else None)
         status = _status(folder, plans.extended(before, experiments, together))
-        with _reporting(folder, report, progress) as listen, Requests() as requests:
+        with reporting(folder, report, progress) as listen, Requests() as requests:
             try:
                 _loop(folder, status, launcher, listen, requests)
             finally:
@@ -85,7 +85,7 @@ def sweep(
 
 
 @contextlib.contextmanager
-def _reporting(folder: pathlib.Path, report: Report | None, progress: bool) -> Iterator[Report]:
+def reporting(folder: pathlib.Path, report: Report | None, progress: bool) -> Iterator[Report]:
     """Yields a function to call with every state of the sweep. It calls `report`, and the display if `progress`."""
     with contextlib.ExitStack() as stack:
         listeners = [] if report is None else [report]
@@ -143,11 +143,14 @@ def reason(log: pathlib.Path, code: int) -> str:
     return messages[-1] if messages else f"it ended with code {code} and printed nothing"
 
 
-def _lock(folder: pathlib.Path) -> Any:
+def lock(folder: pathlib.Path) -> Any:
+    """Make the folder of a sweep, and lock it against other processes.
+
+    Raises:
+        UserError: it cannot be made, or another process uses it.
+    """
     try:
         (folder / "logs").mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UserError(
-            f"The sweep's folder {folder} cannot be made ({error.strerror}): choose another --out."
-        ) from None
+        raise UserError(f"The folder {folder} cannot be made ({error.strerror}): choose another --out.") from None
     return locked(folder, "is in use")
