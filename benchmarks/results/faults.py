@@ -24,7 +24,7 @@ from beliefrl.analysis.palette import colours
 
 AGENTS = ("sac-mlp", "predictive-sac")
 TASK = "pendulum"
-LEVELS = {"noise": (0.1, 0.3, 1.0), "flicker": (0.2, 0.5, 0.8)}
+LEVELS = {"noise": (0.3, 1.0), "flicker": (0.2, 0.5)}
 LABELS = {"noise": "standard deviation of the noise", "flicker": "probability that an observation is lost"}
 RANDOM = BOUNDS[TASK][0]
 
