@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from beliefrl.training.stop import Stopped
     from beliefrl.training.train import resume, train
     from beliefrl.types import Spec, StoredTimestep, Timestep, UserError, Window, WindowShape
+    from beliefrl.viewing.demo import demo
     from beliefrl.viewing.episodes import Trajectory, play
     from beliefrl.viewing.films import film, video
     from beliefrl.viewing.prediction import Predictions, draw_predictions, predictions
@@ -60,6 +61,7 @@ __all__ = [
     "UserError",
     "Window",
     "WindowShape",
+    "demo",
     "draw_curve",
     "draw_predictions",
     "evaluate",
@@ -102,6 +104,7 @@ _HOMES = {
     "UserError": "types:UserError",
     "Window": "types:Window",
     "WindowShape": "types:WindowShape",
+    "demo": "viewing.demo:demo",
     "draw_curve": "analysis.curves:draw_curve",
     "draw_predictions": "viewing.prediction:draw_predictions",
     "evaluate": "training.evaluation:evaluate",

@@ -11,6 +11,7 @@ HELP = """usage: beliefrl COMMAND ...
 
 Reinforcement learning for agents that do not see the whole state.
 
+  beliefrl demo [TASK]          watch a small trained agent that comes with the package
   beliefrl train AGENT TASK     train, with a live view, into a run's folder
   beliefrl resume RUN           go on with a training that was stopped or killed, or train it longer
   beliefrl sweep --preset NAME  many trainings: agents x tasks x settings x seeds, on all cores or a Ray cluster
