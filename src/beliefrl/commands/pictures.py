@@ -13,7 +13,7 @@ import tyro
 
 from beliefrl.commands.arguments import OwnAgent, own_agent, parse
 
-SPARING = 20  # frames per second of a demo's film at most, so that it is written in seconds
+SPARING = 20.0  # frames per second of a demo's film at most, so that it is written in seconds
 
 
 @dataclasses.dataclass(frozen=True)

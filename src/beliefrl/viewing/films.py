@@ -31,7 +31,7 @@ from beliefrl.viewing import rendering
 from beliefrl.viewing.episodes import Frame, Player, Trajectory, check_episode
 from beliefrl.viewing.rendering import Pixels
 
-FASTEST = 50  # frames per second that GIFs and screens can show
+FASTEST = 50.0  # frames per second that GIFs and screens can show
 Writer = Callable[[Pixels], None]
 
 
