@@ -1,14 +1,8 @@
 """Pack an agent for `beliefrl demo`: `python benchmarks/results/demo.py RUN`.
 
-The agents of the package are trained by
-
-    small="--d-size 64 --hidden-size 64 --policy-layers 64 64 --value-layers 64 64 --eval-episodes 20 --seeds 3"
-    beliefrl train predictive-sac pendulum-v --steps 10000 --eval-every 2000 $small --out runs/demo-pendulum-v
-    beliefrl train predictive-sac cartpole-v --steps 16000 --eval-every 4000 $small --out runs/demo-cartpole-v
-    beliefrl train predictive-sac target-reaching --steps 60000 --eval-every 4000 $small --out runs/demo-target-reaching
-
-Each seed of RUN plays 100 episodes. The seed with the highest mean return (mode actions) is packed into the package, as
-a run of its own. It plays 100 further episodes; their returns and those of all seeds are in its results.json.
+docs/viewing.md has the commands that train the agents. Each seed of RUN plays 100 episodes. The seed with the highest
+mean return (mode actions) is packed into the package, as a run of its own. It plays 100 further episodes; their
+returns and those of all seeds are in its results.json.
 """
 
 import json
