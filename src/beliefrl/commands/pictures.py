@@ -93,7 +93,7 @@ class FilmOptions:
 class DemoOptions:
     """Watch a small trained agent that comes with the package: in a window, or in a film if there is no display."""
 
-    task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")] = "pendulum-v"
+    task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="[TASK]")] = "pendulum-v"
     """cartpole-v or pendulum-v."""
     out: Annotated[pathlib.Path | None, tyro.conf.arg(metavar="FILE")] = None
     """The film to write, .gif or .mp4. An existing file is replaced. None: a window if there is a display and pygame
