@@ -129,7 +129,7 @@ MISTAKES = {
     "video untrained film.gif --fps 0": "fps=0.0 is impossible",
     "video untrained film.gif --fps nan": "fps=nan is impossible",
     "video untrained film.gif --steps 0": "steps=0 is impossible",
-    "demo cartpol": "no trained agent for 'cartpol': there is one for cartpole-v, pendulum-v",
+    "demo cartpol": "no trained agent for 'cartpol': there is one for cartpole-v, pendulum-v, target-reaching",
     "demo --out film.avi": "must end in .mp4 or .gif",
     "demo --out nowhere/film.gif": "there is no folder nowhere",
     "demo --out film.gif --unpack there": "there exists already",

@@ -25,7 +25,7 @@ def demo(task: str, folder: str | os.PathLike[str]) -> Run:
     `evaluate`, `load`, `video` and the other functions take this run as they take one of your own trainings.
 
     Args:
-        task: cartpole-v or pendulum-v.
+        task: cartpole-v, pendulum-v or target-reaching.
         folder: the run's folder, which must not exist yet. Missing parent folders are made.
 
     Raises:
