@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from beliefrl.training.stop import Stopped
     from beliefrl.training.train import resume, train
     from beliefrl.types import Spec, StoredTimestep, Timestep, UserError, Window, WindowShape
+    from beliefrl.viewing.demo import demo
     from beliefrl.viewing.episodes import Trajectory, play
     from beliefrl.viewing.films import film, video
     from beliefrl.viewing.prediction import Predictions, draw_predictions, predictions
@@ -67,6 +68,7 @@ __all__ = [
     "Window",
     "WindowShape",
     "check",
+    "demo",
     "draw_curve",
     "draw_predictions",
     "evaluate",
@@ -114,6 +116,7 @@ _HOMES = {
     "Window": "types:Window",
     "WindowShape": "types:WindowShape",
     "check": "tasks.check:check",
+    "demo": "viewing.demo:demo",
     "draw_curve": "analysis.curves:draw_curve",
     "draw_predictions": "viewing.prediction:draw_predictions",
     "evaluate": "training.evaluation:evaluate",

@@ -1,7 +1,10 @@
-"""Videos and film strips: every frame at its time, and no half-written file."""
+"""Videos, film strips and demos: every frame at its time, and no half-written file."""
 
+import fnmatch
+import pathlib
 import subprocess
 import sys
+import tomllib
 
 import numpy as np
 import pytest
@@ -10,10 +13,11 @@ from PIL import Image, ImageSequence
 import beliefrl
 from beliefrl import tasks
 from beliefrl.cli import main
+from beliefrl.commands import pictures
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.evaluation import restore_seed
 from beliefrl.types import UserError
-from beliefrl.viewing import films
+from beliefrl.viewing import demo, films
 from worlds import Counter, saved
 
 TASK = tasks.make("pendulum-p", max_steps=5)
@@ -145,3 +149,111 @@ def test_the_commands_write_their_files(tmp_path, capsys, monkeypatch):
         assert f"written to {line}\n" in out
     names = ("film.gif", "strip.png", "strip.pdf", "run/predictions.png", "run/predictions.pdf")
     assert all((tmp_path / name).stat().st_size > 1000 for name in names)
+
+
+def test_a_gif_of_a_photograph_has_the_colours_of_the_photograph():
+    """A drawing may lose a little of its colours, for speed; a picture of many colours must not become worse."""
+    x, y = np.meshgrid(np.arange(96), np.arange(64))
+    photograph = np.stack([2.6 * x, 4 * y, x + y], -1).astype(np.uint8)
+    drawing = np.where((x < 48)[..., None], np.uint8([251, 250, 247]), np.uint8([200, 85, 61]))
+    for pixels, most in ((photograph, 4), (drawing, 2)):
+        found = np.array(films._reduced(Image.fromarray(pixels)).convert("RGB"))
+        assert np.abs(found.astype(int) - pixels).mean() < most
+
+
+@pytest.fixture
+def window(monkeypatch):
+    """pygame, drawing into nowhere."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    return pytest.importorskip("pygame")
+
+
+def test_a_window_shows_every_frame_and_is_closed_at_the_end(run, window, monkeypatch):
+    shown = []
+    monkeypatch.setattr(
+        window.display, "flip", lambda: shown.append(window.surfarray.array3d(window.display.get_surface()))
+    )
+    films.video(run, None, fps=1000.0)
+    assert [picture.shape for picture in shown] == 6 * [(480, 512, 3)]
+    assert window.display.get_surface() is None
+
+
+def test_closing_the_window_ends_the_film(run, window, monkeypatch):
+    monkeypatch.setattr(window.display, "flip", lambda: window.event.post(window.event.Event(window.QUIT)))
+    with pytest.raises(KeyboardInterrupt, match="the window was closed"):
+        films.video(run, None, fps=1000.0)
+    assert not window.display.get_init()
+
+
+def test_no_window_is_drawn_where_nobody_sees_it(run, window, monkeypatch):
+    for name in ("SDL_VIDEODRIVER", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("DISPLAY", ":987")
+    monkeypatch.setattr(window.display, "get_driver", lambda: "offscreen")
+    with pytest.raises(UserError, match=r"A window cannot be opened .*: write a film instead"):
+        films.video(run, None)
+
+
+# Demos
+
+
+def test_the_package_contains_the_demos_and_the_help_names_them(capsys):
+    assert demo.names() == ["cartpole-v", "pendulum-v", "target-reaching"]
+    text = (pathlib.Path(__file__).parents[2] / "pyproject.toml").read_text()
+    (pattern,) = tomllib.loads(text)["tool"]["setuptools"]["package-data"]["beliefrl.viewing"]
+    with pytest.raises(SystemExit):
+        main(["demo", "--help"])
+    shown = capsys.readouterr().out
+    for file in demo.FOLDER.iterdir():
+        assert fnmatch.fnmatch(f"{demo.FOLDER.name}/{file.name}", pattern)
+        assert file.stat().st_size < 300_000
+        assert file.stem in shown
+        assert file.stem in demo.demo.__doc__
+
+
+@pytest.mark.parametrize(("task", "tolerance"), [("cartpole-v", 100), ("pendulum-v", 100), ("target-reaching", 50)])
+def test_a_demo_is_a_run_that_acts_as_well_as_it_says(tmp_path, task, tolerance):
+    run = beliefrl.demo(task, tmp_path / "run")
+    assert run.config["task"] == task
+    assert run.damage() == []
+    returns = beliefrl.evaluate(run, 10, progress=False)["mode"]["mean"]
+    assert returns == pytest.approx(run.results()["mode"]["mean"], abs=tolerance)
+    with pytest.raises(UserError, match="run exists already"):
+        beliefrl.demo(task, run.folder)
+
+
+@pytest.fixture
+def no_display(tmp_path, monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.chdir(tmp_path)
+
+
+def test_without_a_display_a_demo_writes_a_film_and_says_how_the_agent_was_trained(
+    tmp_path, no_display, monkeypatch, capsys
+):
+    monkeypatch.setattr(pictures, "SPARING", 1.0)  # frame per second
+    main(["demo", "--unpack", "run"])
+    first, trained, *_, episode, copied, written = capsys.readouterr().out.splitlines()
+    assert first.startswith("predictive-sac on pendulum-v: 10,000 steps, seed ")
+    assert first.endswith(", the best of 0, 1, 2")
+    assert trained.startswith("trained on cpu, 20")
+    assert episode.startswith("episode 4: 200 steps, return -")
+    assert (copied, written) == ("copied to run", "written to beliefrl-demo-pendulum-v.gif")
+    assert len(list(frames_of(tmp_path / "beliefrl-demo-pendulum-v.gif"))) == 11
+    assert beliefrl.Run("run").config["task"] == "pendulum-v"
+
+
+def test_with_a_display_a_demo_opens_a_window_and_writes_nothing(tmp_path, no_display, monkeypatch, capsys):
+    paths = []
+    monkeypatch.setattr(films, "video", lambda run, path, **_: paths.append(path) or [])
+    monkeypatch.setenv("WAYLAND_DISPLAY", "wayland-0")
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: name)
+    main(["demo"])
+    main(["demo", "--out", "film.gif"])
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)  # pygame is not installed
+    main(["demo"])
+    assert paths == [None, pathlib.Path("film.gif"), pathlib.Path("beliefrl-demo-pendulum-v.gif")]
+    assert list(tmp_path.iterdir()) == []
+    capsys.readouterr()

@@ -17,6 +17,7 @@ COMMANDS: dict[str, str] = {  # module:function, imported when it is called
     "predict": "pictures:predict",
     "video": "pictures:video",
     "film": "pictures:film",
+    "demo": "pictures:demo",
     "tasks": "lists:list_tasks",
     "agents": "lists:list_agents",
     "bench": "bench:bench",

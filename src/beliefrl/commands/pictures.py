@@ -1,13 +1,19 @@
-"""Pictures of trained agents: `beliefrl predict`, `video` and `film`."""
+"""Pictures of trained agents: `beliefrl predict`, `video`, `film` and `demo`."""
 
 import dataclasses
+import importlib.util
+import os
 import pathlib
+import sys
+import tempfile
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
 from beliefrl.commands.arguments import Best, OwnAgent, own_agent, parse
+
+SPARING = 20.0  # frames per second of a demo's film at most, so that it is written in seconds
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,6 +92,22 @@ class FilmOptions:
     agent: OwnAgent = None
 
 
+@dataclasses.dataclass(frozen=True)
+class DemoOptions:
+    """Watch a small trained agent that comes with the package: in a window, or in a film if there is no display."""
+
+    task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="[TASK]")] = "pendulum-v"
+    """cartpole-v, pendulum-v or target-reaching."""
+    out: Annotated[pathlib.Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """The film to write, .gif or .mp4. An existing file is replaced. None: a window if there is a display and pygame
+    (extra `render`), otherwise beliefrl-demo-TASK.gif."""
+    episode_seed: int = 4
+    """Random seed of the episode. The same seed gives the same episode."""
+    unpack: Annotated[pathlib.Path | None, tyro.conf.arg(metavar="RUN")] = None
+    """A new folder, into which the agent is copied as a run, for commands such as `beliefrl evaluate RUN`. None: it is
+    not copied."""
+
+
 def predict(argv: Sequence[str]) -> None:
     """`beliefrl predict RUN ...`."""
     options = parse(PredictOptions, argv, "beliefrl predict")
@@ -110,9 +132,7 @@ def video(argv: Sequence[str]) -> None:
     played = films.video(
         options.run, options.out, agent=own_agent(options.agent), **{name: getattr(options, name) for name in names}
     )
-    for index, episode in enumerate(played):
-        length = len(episode.steps.reward) - 1
-        print(f"episode {options.episode_seed + index}: {length} steps, {episode.summary}")
+    _print_episodes(played, options.episode_seed)
     print(f"written to {options.out}")
 
 
@@ -124,6 +144,52 @@ def film(argv: Sequence[str]) -> None:
     names = ("frames", "seed", "episode_seed", "sampled", "best", "steps")
     given = {name: getattr(options, name) for name in names}
     _written(films.film(options.runs, options.out, agent=own_agent(options.agent), **given))
+
+
+def demo(argv: Sequence[str]) -> None:
+    """`beliefrl demo [TASK] ...`."""
+    options = parse(DemoOptions, argv, "beliefrl demo")
+    from beliefrl.viewing import films
+    from beliefrl.viewing.demo import demo as copy
+    from beliefrl.viewing.episodes import check_episode
+
+    out = options.out or (None if _has_screen() else pathlib.Path(f"beliefrl-demo-{options.task}.gif"))
+    check_episode(options.episode_seed)  # these two raise an error before anything is written
+    if out is not None:
+        films.kind_of(out)
+    with tempfile.TemporaryDirectory() as temporary:
+        run = copy(options.task, options.unpack or pathlib.Path(temporary) / "run")
+        _print_origin(run)
+        fastest = films.FASTEST if out is None else SPARING
+        played = films.video(run, out, episode_seed=options.episode_seed, fastest=fastest)
+    _print_episodes(played, options.episode_seed)
+    if options.unpack is not None:
+        print(f"copied to {options.unpack}")
+    if out is not None:
+        print(f"written to {out}")
+
+
+def _has_screen() -> bool:
+    """Whether a window can be expected to open: pygame is installed, and there is a display."""
+    displays = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    return importlib.util.find_spec("pygame") is not None and (sys.platform != "linux" or bool(displays))
+
+
+def _print_origin(run: Any) -> None:
+    """How the agent of a demo was trained, and its returns."""
+    config, results = run.config, run.results()
+    commit, seeds = str(config["git_commit"])[:12], ", ".join(map(str, results["chosen_from"]["seeds"]))
+    print(f"{config['agent']} on {config['task']}: {results['step']:,} steps, seed {run.seeds[0]}, the best of {seeds}")
+    print(f"trained on {config['device']}, {config['started'][:10]}, commit {commit}")
+    for mode in ("sampled", "mode"):
+        success = "" if results[mode]["success"] is None else f", success {results[mode]['success']:.0%}"
+        print(f"{results['episodes']} episodes, {mode} actions: mean return {results[mode]['mean']:.1f}{success}")
+
+
+def _print_episodes(played: Sequence[Any], first: int) -> None:
+    """The length and return of each episode that was shown; `first` is the seed of the first."""
+    for index, episode in enumerate(played):
+        print(f"episode {first + index}: {len(episode.steps.reward) - 1} steps, {episode.summary}")
 
 
 def _written(path: pathlib.Path) -> None:

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import os
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -9,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw
 
-from beliefrl.types import UserError
+from beliefrl.types import UserError, one_line
 
 Point = Any  # (x, y) as a tuple or an array; x points right, y points up
 Points = Any  # a sequence of points, or an array (points, 2)
@@ -98,17 +99,35 @@ class Viewer:
         self._pygame, self._title, self._clock = pygame, title, pygame.time.Clock()
 
     def show(self, pixels: UInt8[np.ndarray, "height width 3"], fps: int) -> None:
-        """Show a picture, at least 1 / fps seconds after the previous one."""
+        """Show a picture, at least 1 / fps seconds after the previous one.
+
+        Raises:
+            UserError: the window cannot be opened.
+        """
         height, width, _ = pixels.shape
         screen = self._pygame.display.get_surface()
         if screen is None:
-            self._pygame.display.init()
-            screen = self._pygame.display.set_mode((width, height))
+            screen = self._opened(width, height)
             self._pygame.display.set_caption(self._title)
         self._pygame.event.pump()  # otherwise the system considers the window unresponsive
         screen.blit(self._pygame.image.frombuffer(pixels.tobytes(), (width, height), "RGB"), (0, 0))
         self._pygame.display.flip()
         self._clock.tick(fps)
+
+    def _opened(self, width: int, height: int) -> Any:
+        display = self._pygame.display
+        try:
+            display.init()
+            if display.get_driver() == "offscreen" and "SDL_VIDEODRIVER" not in os.environ:
+                raise self._pygame.error("there is no display")  # SDL would draw where nobody sees it
+            return display.set_mode((width, height))
+        except self._pygame.error as error:
+            raise UserError(f"A window cannot be opened ({one_line(str(error))}): write a film instead.") from None
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the user has asked to close the window."""
+        return self._pygame.display.get_init() and self._pygame.event.peek(self._pygame.QUIT)
 
     def close(self) -> None:
         self._pygame.display.quit()

@@ -1,9 +1,11 @@
 """Videos and film strips of trained agents.
 
-A video is an mp4 file (encoded by imageio-ffmpeg, extra `video`) or a GIF (encoded by Pillow). A film strip has one row
-of frames per run, evenly spaced in time (Appendix "Visualization of Trained Agents").
+A video is an mp4 file (encoded by imageio-ffmpeg, extra `video`), a GIF (encoded by Pillow), or shown in a window (by
+pygame, extra `render`). A film strip has one row of frames per run, evenly spaced in time (Appendix "Visualization of
+Trained Agents").
 """
 
+import functools
 import math
 import os
 import pathlib
@@ -21,7 +23,7 @@ from beliefrl.analysis import figures
 from beliefrl.runs.arrays import replacing
 from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
-from beliefrl.tasks.drawing import INK, PAPER
+from beliefrl.tasks.drawing import INK, PAPER, Viewer
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.evaluation import restore_seed
 from beliefrl.types import LARGEST, UserError
@@ -29,13 +31,13 @@ from beliefrl.viewing import rendering
 from beliefrl.viewing.episodes import Frame, Player, Trajectory, check_episode
 from beliefrl.viewing.rendering import Pixels
 
-FASTEST = 50  # frames per second that GIFs and screens can show
+FASTEST = 50.0  # frames per second that GIFs and screens can show
 Writer = Callable[[Pixels], None]
 
 
 def video(
     run: Run | str | os.PathLike[str],
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str] | None,
     seed: int | None = None,
     episode_seed: int = 0,
     sampled: bool = False,
@@ -45,39 +47,42 @@ def video(
     task: Task | GymnasiumTask | None = None,
     agent: Agent | type | None = None,
     best: bool = False,
+    fastest: float = FASTEST,
 ) -> list[Trajectory]:
     """Record a video of a run's trained agent; returns the episodes, without frames. No file is left half written.
 
     Args:
         run: a run, or its folder.
-        path: the video, .mp4 or .gif. An existing file is replaced.
+        path: the video, .mp4 or .gif. An existing file is replaced. None: a window shows the episodes, which needs a
+            display and pygame.
         seed: one of the run's seeds; None: its first.
         episode_seed: random seed of the first episode; the next episodes have the following seeds.
         sampled: sample the actions, instead of taking the policy's mode.
         episodes: number of episodes, shown one after the other.
-        fps: timesteps per second of the video, each with a frame. None: real time, with at most 50 frames per second;
-            a task whose step has no known duration gets 10 steps per second.
+        fps: timesteps per second of the video, each with a frame. None: real time, with at most `fastest` frames per
+            second; a task whose step has no known duration gets 10 steps per second.
         steps: stop each episode after this many steps; None: play until the task ends it.
         task: needed only if the run was trained on a task of your own.
         agent: needed only if the run was trained by an agent of your own: its class, or an instance.
         best: take the seed's best agent, not its last one; see `evaluate`.
+        fastest: the highest number of frames per second if `fps` is None.
 
     Raises:
         UserError: there is no such run or seed, a number is impossible, the task cannot be rendered, imageio-ffmpeg is
-            missing, or the file cannot be written.
+            missing, the file cannot be written, or no window can be opened.
+        KeyboardInterrupt: the window was closed.
     """
-    path = pathlib.Path(path)
     check_episode(episode_seed, steps)
     if not 1 <= episodes <= LARGEST:
         raise UserError(f"episodes={episodes} is impossible: it must be a whole number of at least 1.")
-    if fps is not None and not 0 < fps <= 1000:
-        raise UserError(f"fps={fps} is impossible: it must be a number above 0 and up to 1000.")
-    kind = _kind(path)
-    figures.check_folder(path)
+    for name, rate in {"fps": fps, "fastest": fastest}.items():
+        if rate is not None and not 0 < rate <= 1000:
+            raise UserError(f"{name}={rate} is impossible: it must be a number above 0 and up to 1000.")
+    show = _window if path is None else functools.partial(_encoder, pathlib.Path(path), kind_of(pathlib.Path(path)))
     with Player(*restore_seed(run, seed, task, agent, best), rendered=True) as player:
         pace = rendering.pace(player.environment)
-        every = 1 if fps else math.ceil(pace / FASTEST)
-        with _encoder(path, kind, fps or pace / every) as add:
+        every = 1 if fps else math.ceil(pace / fastest)
+        with show(fps or pace / every) as add:
             return [
                 player.play(
                     episode_seed + index, sampled, steps, range(0, LARGEST, every), _captioned(add, index, episodes)
@@ -86,8 +91,28 @@ def video(
             ]
 
 
-def _kind(path: pathlib.Path) -> str:
-    """The file type of the video: ".mp4" or ".gif"."""
+@contextmanager
+def _window(fps: float) -> Iterator[Writer]:
+    """A function that shows a frame in a window."""
+    viewer = Viewer("BeliefRL")
+
+    def add(pixels: Pixels) -> None:
+        viewer.show(pixels, round(fps))
+        if viewer.is_closed:
+            raise KeyboardInterrupt("the window was closed.")
+
+    try:
+        yield add
+    finally:
+        viewer.close()
+
+
+def kind_of(path: pathlib.Path) -> str:
+    """The file type of a video, ".mp4" or ".gif".
+
+    Raises:
+        UserError: it is neither, imageio-ffmpeg is missing, or the folder of the video does not exist.
+    """
     kind = path.suffix.lower()
     if kind not in (".mp4", ".gif"):
         raise UserError(f"{path} is impossible: the name of a video must end in .mp4 or .gif.")
@@ -96,6 +121,7 @@ def _kind(path: pathlib.Path) -> str:
             import imageio_ffmpeg  # noqa: F401  # pyright: ignore[reportMissingImports]
         except ImportError:
             raise UserError("An mp4 needs imageio-ffmpeg: pip install 'beliefrl[video]', or make a .gif.") from None
+    figures.check_folder(path)
     return kind
 
 
@@ -144,19 +170,8 @@ def _mp4(path: pathlib.Path, fps: float) -> Iterator[Writer]:
     import imageio_ffmpeg  # pyright: ignore[reportMissingImports]
 
     # imageio-ffmpeg's own writer forks this process. That may hang, since JAX runs threads in it.
-    encoding = [
-        "-c:v",
-        "libx264",
-        "-pix_fmt",
-        "yuv420p",
-        "-crf",
-        "18",
-        "-movflags",
-        "+faststart",
-        "-f",
-        "mp4",
-        str(path),
-    ]
+    codec = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "18"]
+    encoding = [*codec, "-movflags", "+faststart", "-f", "mp4", str(path)]
     encoder: Any = None
 
     def add(pixels: Pixels) -> None:
@@ -184,9 +199,16 @@ def _mp4(path: pathlib.Path, fps: float) -> Iterator[Writer]:
 def _gif(path: pathlib.Path, fps: float) -> Iterator[Writer]:
     """Keep all frames, reduced to 256 colours, and encode them at the end."""
     frames: list[Image.Image] = []
-    yield lambda pixels: frames.append(Image.fromarray(pixels).quantize(dither=Image.Dither.NONE))
+    yield lambda pixels: frames.append(_reduced(Image.fromarray(pixels)))
     delay = max(2, round(100 / fps)) * 10  # milliseconds, a multiple of 10 as GIF requires
     frames[0].save(path, "GIF", save_all=True, append_images=frames[1:], duration=delay, loop=0)
+
+
+def _reduced(image: Image.Image) -> Image.Image:
+    """The image with at most 256 colours. An octree is fast, and good enough for drawings of few colours."""
+    drawn = image.getcolors(maxcolors=1024) is not None
+    method = Image.Quantize.FASTOCTREE if drawn else Image.Quantize.MEDIANCUT
+    return image.quantize(method=method, dither=Image.Dither.NONE)
 
 
 def film(

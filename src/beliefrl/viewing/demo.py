@@ -1,0 +1,45 @@
+"""Small trained agents that come with the package, for `beliefrl demo`.
+
+Each is a zip file with the folder of a run: its settings, log, evaluation and agent. `benchmarks/results/demo.py` makes
+these files.
+"""
+
+import os
+import pathlib
+import zipfile
+
+from beliefrl.runs.run import Run
+from beliefrl.types import UserError, short
+
+FOLDER = pathlib.Path(__file__).parent / "demos"
+
+
+def names() -> list[str]:
+    """The tasks for which there is a trained agent."""
+    return sorted(path.stem for path in FOLDER.glob("*.zip"))
+
+
+def demo(task: str, folder: str | os.PathLike[str]) -> Run:
+    """Copy a trained agent that comes with the package into a new folder; returns its run.
+
+    `evaluate`, `load`, `video` and the other functions take this run as they take one of your own trainings.
+
+    Args:
+        task: cartpole-v, pendulum-v or target-reaching.
+        folder: the run's folder, which must not exist yet. Missing parent folders are made.
+
+    Raises:
+        UserError: there is no trained agent for the task, or the folder exists already or cannot be made.
+    """
+    if task not in names():
+        raise UserError(f"There is no trained agent for {short(task)}: there is one for {', '.join(names())}.")
+    folder = pathlib.Path(folder)
+    try:
+        folder.mkdir(parents=True)
+        with zipfile.ZipFile(FOLDER / f"{task}.zip") as packed:
+            packed.extractall(folder)
+    except FileExistsError:
+        raise UserError(f"{folder} exists already: choose another folder.") from None
+    except OSError as error:
+        raise UserError(f"{folder} cannot be made ({error.strerror}): choose another folder.") from None
+    return Run(folder)
