@@ -333,14 +333,14 @@ def test_a_callback_stops_a_training_that_goes_on_to_the_last_bit(whole, tmp_pat
         notes.append(event.note)
         return event.evaluation is not None and np.all(event.evaluation.done)
 
-    run = train(AGENT, "pendulum-v", tmp_path / "run", stop, **OPTIONS | {"checkpoint_steps": 0})
+    run = train(AGENT, "pendulum-v", tmp_path / "run", callback=stop, **OPTIONS | {"checkpoint_steps": 0})
     assert run.results()["step"] == 120
     assert [note for note in notes if note] == [
         f"stopped by the callback at step 120; `beliefrl resume {run.folder}` goes on from there, in Python "
         f"beliefrl.resume({str(run.folder)!r})"
     ]
     assert not is_finished(run)
-    resume(run, callback=lambda event: "only True stops it")
+    resume(run, callback=lambda event: "only True stops it", report=lambda event: True)
     assert files(run.folder) == files(whole[0])
 
 
