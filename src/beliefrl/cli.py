@@ -11,7 +11,9 @@ HELP = """usage: beliefrl COMMAND ...
 
 Reinforcement learning for agents that do not see the whole state.
 
-ba  beliefrl train AGENT TASK     train, with a live view, into a run's folder
+  beliefrl demo [TASK]          watch a small trained agent that comes with the package
+  beliefrl check TASK           what a task observes and wants, and what the training would refuse
+  beliefrl train AGENT TASK     train, with a live view, into a run's folder
   beliefrl resume RUN           go on with a training that was stopped or killed, or train it longer
   beliefrl sweep --preset NAME  many trainings: agents x tasks x settings x seeds, on all cores or a Ray cluster
   beliefrl tune AGENT TASK      search for good hyperparameters with Optuna, in many trainings
