@@ -14,11 +14,11 @@ Reinforcement learning for agents that do not see the whole state.
   beliefrl demo [TASK]          watch a small trained agent that comes with the package
   beliefrl check TASK           what a task observes and wants, and what the training would refuse
   beliefrl train AGENT TASK     train, with a live view, into a run's folder
-  beliefrl resume RUN           go on with a training that was stopped or killed, or train it longer
+  beliefrl resume RUN           continue a training that was stopped or killed, or train it longer
   beliefrl sweep --preset NAME  many trainings: agents x tasks x settings x seeds, on all cores or a Ray cluster
   beliefrl tune AGENT TASK      search for good hyperparameters with Optuna, in many trainings
   beliefrl figure KIND RUNS     the paper's figures and tables from finished runs: curves, ablation, elbo, ...
-  beliefrl show RUN             what a run was made with, how far it is, and what it is worth
+  beliefrl show RUN             the settings, progress and results of a run
   beliefrl evaluate RUN         play new episodes with what a run has learned
   beliefrl export RUN FILE      write the learned policy as one file, for jax or (.onnx) for onnxruntime
   beliefrl report RUNS          one page for the browser: curves, final returns, settings, time

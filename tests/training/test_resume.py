@@ -142,7 +142,7 @@ def test_what_is_no_unfinished_training_is_not_cleared(whole, tmp_path, capsys):
     shutil.copytree(whole[0], finished, ignore=shutil.ignore_patterns("checkpoints"))
     (other / "metrics").mkdir(parents=True)
     (other / "metrics" / "thesis.tex").touch()
-    for folder, why in ((finished, "has no checkpoint to go on from any more"), (other, "exists already")):
+    for folder, why in ((finished, "has no usable checkpoint left"), (other, "exists already")):
         before = sorted(folder.rglob("*"))
         with pytest.raises(SystemExit):
             main([*LINE.split(), str(folder)])
@@ -213,7 +213,7 @@ def test_the_log_has_no_gap_and_no_row_twice(whole):
 def test_where_the_checkpoints_are_gone_there_is_a_sentence(whole, tmp_path):
     (tmp_path / "run" / "checkpoints" / "damaged-000001-step-20").mkdir(parents=True)
     (tmp_path / "run" / "config.json").write_bytes((whole[0] / "config.json").read_bytes())
-    with pytest.raises(UserError, match="has no checkpoint to go on from any more"):
+    with pytest.raises(UserError, match="has no usable checkpoint left"):
         resume(tmp_path / "run")
     with pytest.raises(UserError, match="There is no run folder"):
         resume(tmp_path / "nowhere")

@@ -45,7 +45,7 @@ class Agent(Protocol):
 
     @property
     def pretrain_windows(self) -> int:
-        """How many of them `pretrain` is given."""
+        """Number of windows that `pretrain` is given."""
         ...
 
     @property
@@ -68,7 +68,7 @@ class Agent(Protocol):
     def reset(self, spec: Spec) -> Any:
         """The empty memory of one actor: arrays, not necessarily zeros.
 
-        Whoever runs an episode gives it to `act` at the first timestep.
+        The caller passes it to `act` at the first timestep.
         """
         ...
 
@@ -82,7 +82,7 @@ class Agent(Protocol):
         ...
 
     def note(self, memory: Any) -> Any:
-        """What the replay shall keep of a memory beside the timestep that it has just perceived."""
+        """What the replay stores with a timestep, given the memory after it."""
         ...
 
     def pretrain(self, state: Any, windows: Window, key: Key[Array, ""]) -> tuple[Any, Metrics]:
@@ -129,7 +129,7 @@ def defaults() -> dict[str, dict[str, Any]]:
 
 
 def find_class(name: str) -> type:
-    """The class of the agent of that name, which may be `module:Class`: never call it with what only a file says.
+    """The class of the agent of that name, which may be `module:Class`: pass only names that the user gave: it may import a module.
 
     Raises:
         UserError: no agent has that name, or the class is no agent.
@@ -143,7 +143,7 @@ def find_class(name: str) -> type:
 
 
 def check_class(kind: type) -> type:
-    """The same class, once it is sure to be one of agents.
+    """Check that a class is an agent's, and return it.
 
     Raises:
         UserError: it is no frozen dataclass, or lacks something that an agent has.

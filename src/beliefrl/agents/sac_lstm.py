@@ -47,7 +47,7 @@ class SACLSTMAgent(SACAgent):
     lr_lstm: float = 3e-4
     """Adam's learning rate for the LSTM, which learns from the critics and from the actor in turn (authors' code)."""
     pretrain_updates: int = 5000
-    """Updates of the whole at step_start_rl, as many as VRM's pre-training has (Section 5; 0 is off)."""
+    """Updates of the whole agent after step_start_rl steps, as many as VRM's pre-training has (Section 5; 0 is off)."""
     perceive_action: bool = False
     """Let the LSTM perceive the previous action beside the observation (the paper's does not)."""
     perceive_reward: bool = False

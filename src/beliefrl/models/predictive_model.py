@@ -6,7 +6,7 @@ With x_t = (o_t, a_{t-1}, r_{t-1}), observations and rewards in standardised uni
     prediction           = MLP[h_t, a_t]
     J_model              = E ‖prediction - (o_{t+1}, r_t)‖²,  mean over the entries
 
-What h_t must hold to predict is what the history says of the hidden state. Some cells begin with a long memory: their
+To predict, h_t must contain what the history reveals about the hidden state. Some cells begin with a long memory: their
 forget gates' biases are log U(1, T), so that they forget over up to T steps (Tallec and Ollivier 2018, "chrono
 initialisation"). An LSTM that begins as usual forgets an event within some tens of steps and does not learn otherwise
 from predictions one step ahead.

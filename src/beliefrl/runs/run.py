@@ -110,7 +110,7 @@ class Run:
         return self.folder / "metrics" / f"seed-{seed}.jsonl"
 
     def results(self) -> Row | None:
-        """The summary of the last evaluation; None before the first one.
+        """The summary of the last evaluation; None until a training has finished.
 
         Raises:
             UserError: results.json is damaged.

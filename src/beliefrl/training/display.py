@@ -1,4 +1,4 @@
-"""What is shown of a training while it runs and when it ends."""
+"""The display of a training: its progress, then its results."""
 
 import io
 import time
@@ -20,7 +20,7 @@ from beliefrl.types import UserError
 class TrainingDisplay:
     """A live bar with the phase, steps/s, time left and the last returns; a line for every evaluation.
 
-    Where nothing is live there is also a line for every phase. A notebook shows the learning curve as well.
+    In a log, each phase also gets a line. A notebook shows the learning curve as well.
     """
 
     def __init__(self, screen: Screen, run: Run):
@@ -79,7 +79,7 @@ class TrainingDisplay:
     def _speed(self, event: Event, now: float) -> str:
         steps = event.step - self.phase_step
         if steps <= 0:
-            return "(a minute at most)" if event.phase.is_compiling else ""
+            return "(can take a minute)" if event.phase.is_compiling else ""
         rate = steps / (now - self.phase_began)
         return f"{rate:.0f} steps/s, {duration((self.steps - event.step) / rate)} left"
 

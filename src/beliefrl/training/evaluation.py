@@ -113,7 +113,7 @@ def agent_of(run: Run, agent: Agent | type | None = None) -> Agent:
 
 
 def as_argument(run: Run) -> str:
-    """How commands take a run: its folder, and --agent where an agent of a user's was trained."""
+    """How commands take a run: its folder, and --agent if the run has a user's own agent."""
     name = run.config["agent"]
     return f"{run.folder} --agent {one_line(name)}" if agents.is_own(name) else str(run.folder)
 

@@ -1,4 +1,4 @@
-"""An agent in its task: act, step, time limit, reset, record; and evaluation. No other file knows what an episode is.
+"""An agent in its task: act, step, time limit, reset, record; and evaluation.
 
 What happens in one environment step, at timestep t of an episode:
 
@@ -68,7 +68,7 @@ def measured(task: Task, task_state: Any) -> dict[str, Float[Array, ""]]:
 
 
 def strong(tree: Any) -> Any:
-    """The same without weak types, which Python's numbers in a task or agent leave: XLA would compile twice."""
+    """The tree without weak types. Python numbers in a task or agent leave them, and XLA would compile twice."""
 
     def cast(leaf: Any) -> Array:
         leaf = jnp.asarray(leaf)

@@ -51,7 +51,7 @@ class Phase(enum.StrEnum):
     COMPILING_LEARNING = "compiling the learning"
     LEARNING = "learning"
     EVALUATING = "evaluating"
-    TRAINING = "training"  # whichever of these: a note comes from another thread
+    TRAINING = "training"  # for notes from another thread, which do not know the phase
     FAULT = "stopped by a fault"
     FINISHED = "finished"
 

@@ -101,7 +101,7 @@ class Session:
             self.recorder.note_end()
 
     def begin_again(self) -> None:
-        """Clear the log and begin at step 0, for want of a checkpoint."""
+        """Clear the log and begin at step 0, because there is no checkpoint."""
         self.recorder.rewind(dict.fromkeys(self.recorder.seeds, 0))
         self._note("no checkpoint was written: begins again from step 0")
 

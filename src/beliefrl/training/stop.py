@@ -35,7 +35,7 @@ class Stopped(KeyboardInterrupt):
 
 
 class Requests:
-    """While entered, the first signal is kept in `number`; a later one ends the program at once.
+    """Inside the `with` block, the first signal is stored in `number`; a later one ends the program at once.
 
     In an interactive session a later one raises Stopped, as soon as a compiled function returns: the session's
     variables are not lost. A Stopped that leaves is shown without a traceback if nobody catches it.

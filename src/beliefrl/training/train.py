@@ -1,7 +1,4 @@
-"""Train an agent and record it in a run's folder, or go on with that: what is asked for is checked here.
-
-`session` does it.
-"""
+"""`train` and `resume`: check the arguments and open the folder. `session` runs the training."""
 
 import contextlib
 import dataclasses
@@ -148,7 +145,7 @@ def _go_on(
     folder, made_by = run.folder, agent_of(run, agent)
     begins_again = not was_ever_written(folder) and not (folder / "results.json").exists()
     if not (begins_again or listed(folder)):
-        raise UserError(f"{folder} has no checkpoint to go on from any more: train again, with another --out.")
+        raise UserError(f"{folder} has no usable checkpoint left: train again, with another --out.")
     _ = Options(**_options(run) | changes)  # raise before the folder is locked
     with contextlib.ExitStack() as showing, contextlib.ExitStack() as stack:
         recorder = stack.enter_context(Recorder(folder, None))
