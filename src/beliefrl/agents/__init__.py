@@ -129,7 +129,9 @@ def defaults() -> dict[str, dict[str, Any]]:
 
 
 def find_class(name: str) -> type:
-    """The class of the agent of that name, which may be `module:Class`: pass only names that the user gave: it may import a module.
+    """The class of the agent of that name, which may be `module:Class`.
+
+    Pass only names that the user gave: it may import a module.
 
     Raises:
         UserError: no agent has that name, or the class is no agent.

@@ -68,7 +68,7 @@ def _user_folder() -> pathlib.Path:
 
 
 def _remove_unfinished(folder: pathlib.Path) -> None:
-    """Remove entries whose writing was cut off. JAX writes a time beside each at the end, and fails if one is missing."""
+    """Remove entries whose writing was cut off. JAX writes a time beside each at the end, and fails without one."""
     for entry in folder.glob("*-cache"):
         if not entry.with_name(entry.name.removesuffix("-cache") + "-atime").exists():
             entry.unlink()
