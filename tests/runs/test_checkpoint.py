@@ -271,7 +271,7 @@ def test_a_full_disk_is_told_and_the_last_good_one_stands(three, monkeypatch, pl
 
     monkeypatch.setattr(checkpoint, "write_whole", full)
     checkpoints.save(40, {}, tree(40.0), ring.timesteps, ring.added)
-    with pytest.raises(UserError, match=r"cannot be written .No space left on device.: .*beliefrl resume"):
+    with pytest.raises(OSError, match="No space left on device"):
         checkpoints.wait()
     assert restored(folder).step == 30
 

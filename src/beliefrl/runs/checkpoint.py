@@ -74,7 +74,7 @@ class Checkpoints:
             added: (seed,), the number of timesteps that were ever added.
 
         Raises:
-            UserError: the previous checkpoint could not be written.
+            OSError: the previous checkpoint could not be written.
         """
         self.wait()
         state, new = arrays.copied(tree), self._new_timesteps(timesteps, added)
@@ -89,18 +89,11 @@ class Checkpoints:
         """Wait until the last `save` is written.
 
         Raises:
-            UserError: it could not be written.
+            OSError: it could not be written.
         """
         writing, self._writing = self._writing, None
-        if writing is None:
-            return
-        try:
+        if writing is not None:
             writing.result()
-        except OSError as error:
-            raise UserError(
-                f"The checkpoint in {self.folder} cannot be written ({error.strerror}): fix that, then "
-                f"`beliefrl resume {self.folder.parent}` goes on."
-            ) from None
 
     def close(self) -> None:
         """Wait for the last `save`, and end the thread."""
