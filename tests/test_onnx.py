@@ -17,8 +17,8 @@ from beliefrl.types import UserError
 from worlds import CountingAgent, begun, saved, tiny
 
 TASK = tasks.make("pendulum-p", max_steps=20)
-SLOW = (pytest.param(name, marks=pytest.mark.slow) for name in ("vrm-deterministic", "vrm-first", "slac"))
-AGENTS = ("vrm", "sac-mlp", "sac-lstm", "predictive-sac", *SLOW)
+NIGHTLY = (pytest.param(name, marks=pytest.mark.nightly) for name in ("vrm-deterministic", "vrm-first", "slac"))
+AGENTS = ("vrm", "sac-mlp", "sac-lstm", "predictive-sac", *NIGHTLY)
 
 
 def a_policy(name):

@@ -77,7 +77,7 @@ def test_a_truncated_episode_bootstraps_from_its_last_timestep_and_a_terminated_
 
 
 @pytest.mark.parametrize(
-    "name", ["sac-mlp", *(pytest.param(name, marks=pytest.mark.slow) for name in ("vrm", "sac-lstm", "slac"))]
+    "name", ["sac-mlp", *(pytest.param(name, marks=pytest.mark.nightly) for name in ("vrm", "sac-lstm", "slac"))]
 )
 def test_every_agent_learns_from_n_steps_and_as_often_as_it_is_told(name):
     settings = {"policy_layers": (8,), "value_layers": (8,), "batch_size": 2}

@@ -31,9 +31,12 @@ SMALL = {
 }
 
 
+MARKS = {"sac-mlp": (), "vrm": pytest.mark.slow, "predictive-sac": pytest.mark.slow}
+
+
 @pytest.fixture(
     scope="module",
-    params=[name if name == "vrm" else pytest.param(name, marks=pytest.mark.slow) for name in SMALL],
+    params=[pytest.param(name, marks=MARKS.get(name, pytest.mark.nightly)) for name in SMALL],
 )
 def small(request):
     """A small agent's training program and its agent's cycle."""

@@ -108,7 +108,9 @@ def test_beyond_a_time_limit_there_is_value():
     assert float(metrics["q"][0]) == pytest.approx(2.0, abs=0.1)
 
 
-@pytest.mark.parametrize("shown_in", [pytest.param("obs", marks=pytest.mark.slow), "reward"])
+@pytest.mark.parametrize(
+    "shown_in", [pytest.param("obs", marks=pytest.mark.nightly), pytest.param("reward", marks=pytest.mark.slow)]
+)
 def test_what_was_shown_once_is_remembered(shown_in):
     """Without memory the best mean return is 0, with it nearly 1."""
     _, total = learn(Recall(shown_in), 2000, **REMEMBERING)

@@ -62,7 +62,7 @@ def whole(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    "share", [pytest.param(0.3, marks=pytest.mark.slow), 0.6, pytest.param(0.99, marks=pytest.mark.slow)]
+    "share", [pytest.param(0.3, marks=pytest.mark.nightly), 0.6, pytest.param(0.99, marks=pytest.mark.nightly)]
 )
 def test_a_crashed_training_goes_on_to_the_last_bit(whole, tmp_path, share):
     folder, events = whole
@@ -111,8 +111,8 @@ LINE += " --checkpoint-steps 1 --resume --out"
     [
         ("resume", "a log and half a checkpoint"),
         ("train --resume", "a log"),
-        pytest.param("train --resume", "no config", marks=pytest.mark.slow),
-        pytest.param("train", "a log", marks=pytest.mark.slow),
+        pytest.param("train --resume", "no config", marks=pytest.mark.nightly),
+        pytest.param("train", "a log", marks=pytest.mark.nightly),
         pytest.param("python", "a log", marks=pytest.mark.slow),
     ],
 )
@@ -150,8 +150,10 @@ def test_what_is_no_unfinished_training_is_not_cleared(whole, tmp_path, capsys):
         assert sorted(folder.rglob("*")) == before
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["vrm", "sac-lstm", "slac", "predictive-sac"])
+AGENTS = {"vrm": pytest.mark.slow, **dict.fromkeys(("sac-lstm", "slac", "predictive-sac"), pytest.mark.nightly)}
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=mark) for name, mark in AGENTS.items()])
 def test_every_agent_goes_on_to_the_last_bit(tmp_path, name):
     models = {"train_times_fivrm": 10, "d_size": 8, "z_size": 4, "hidden_size": 8}
     sequences = {"seq_len": 8, "burn_in": 4, "batch_size": 2}

@@ -206,9 +206,10 @@ Recorder("run", None).close()  # it is locked no more
 """
 
 
-@pytest.mark.parametrize(
-    "file", ["metrics", *(pytest.param(name, marks=pytest.mark.slow) for name in FILES if name != "metrics")]
-)
+MARKS = {"metrics": (), "checkpoint": pytest.mark.slow}
+
+
+@pytest.mark.parametrize("file", [pytest.param(name, marks=MARKS.get(name, pytest.mark.nightly)) for name in FILES])
 def test_a_disk_that_is_full_is_one_sentence(tmp_path, file):
     command = [sys.executable, "-c", LIMITED, FILES[file]]
     environment = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
