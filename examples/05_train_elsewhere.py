@@ -1,6 +1,6 @@
 """Train another library's agent on a BeliefRL task: RecurrentPPO of sb3-contrib on `pendulum-v`.
 
-    pip install -e . sb3-contrib                      # in a clone of the repository
+    pip install -c constraints.txt -e . sb3-contrib   # in a clone of the repository; it brings PyTorch
     python examples/05_train_elsewhere.py             # 500,000 steps
     python examples/05_train_elsewhere.py --quick     # 2,048 steps, to see it run
 
