@@ -49,7 +49,7 @@ def entries(folder):
     return sorted(folder.rglob("*-cache"))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_results_do_not_depend_on_the_cache(tmp_path):
     cache = tmp_path / "cache"
     *without, notes, _ = trained(tmp_path / "off", BELIEFRL_CACHE="off", XDG_CACHE_HOME=str(cache))
@@ -66,7 +66,7 @@ def test_results_do_not_depend_on_the_cache(tmp_path):
     assert without == first == second
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_garbage_in_the_cache_is_a_warning(tmp_path):
     cache = tmp_path / "cache"
     *whole, _, _ = trained(tmp_path / "first", BELIEFRL_CACHE=str(cache))

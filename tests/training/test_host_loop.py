@@ -57,7 +57,7 @@ class Wrapped(gymnasium.Env):
         return np.asarray(obs), float(reward), *end, self._measures()
 
 
-@pytest.mark.parametrize("name", ["sac-mlp", pytest.param("vrm", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["sac-mlp", pytest.param("vrm", marks=pytest.mark.nightly)])
 def test_the_host_loop_learns_what_the_compiled_loop_learns(name):
     agent, task = agents.make(name, **SHARED, **SMALL[name]), Hanging(max_steps=9)
     keys = jax.random.split(jax.random.key(0), 2)

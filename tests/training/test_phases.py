@@ -31,7 +31,7 @@ SMALL = {
 }
 
 
-MARKS = {"sac-mlp": (), "vrm": pytest.mark.slow, "predictive-sac": pytest.mark.slow}
+MARKS = {"sac-mlp": (), "vrm": pytest.mark.slow}
 
 
 @pytest.fixture(

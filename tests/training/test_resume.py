@@ -73,7 +73,7 @@ def test_a_crashed_training_goes_on_to_the_last_bit(whole, tmp_path, share):
     assert files(tmp_path / "run") == files(folder)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_faults_of_the_sensors_go_on_to_the_last_bit(tmp_path):
     task = make("pendulum-v", faults={"noise": 0.1, "flicker": 0.2, "flicker_flag": True, "delay": 2, "sticky": 0.1})
     events = []
