@@ -2,7 +2,7 @@
 
     pip install -c constraints.txt -e . sb3-contrib   # in a clone of the repository; it brings PyTorch
     python examples/05_train_elsewhere.py             # 500,000 steps
-    python examples/05_train_elsewhere.py --quick     # 2,048 steps, to see it run
+    python examples/05_train_elsewhere.py --quick     # 2,048 steps, to see it run: 40 s of CPU time
 
 The program saves nothing. The return of an episode is about -1200 for a random policy, and -150 if the pendulum is
 swung up and held.
