@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import sys
 import tempfile
 
 # Most of a test's time is compilation. So little is optimised, and what one test has compiled the next ones read, and
@@ -22,6 +23,12 @@ import pytest
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_default_matmul_precision", "highest")  # a GPU would round the factors of products otherwise
 jaxtyping.install_import_hook("beliefrl", "beartype.beartype")  # before the first import of beliefrl
+
+
+@pytest.fixture(autouse=True)
+def path(monkeypatch):
+    """The command line adds "" to sys.path. A test must not depend on one before it that called the command line."""
+    monkeypatch.setattr(sys, "path", sys.path.copy())
 
 
 @pytest.fixture

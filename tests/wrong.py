@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+import time
 
 import gymnasium
 import numpy as np
@@ -182,3 +183,23 @@ def killed(self, result):
 
 Killed = with_step(killed)
 Raising = raising(ValueError("out of range"))
+
+
+# A process of its own imports these, so they are in a module that it finds.
+class Sleeping(Fine):
+    """Its third step takes long."""
+
+    def step(self, action):
+        if self.time == 2:
+            time.sleep(0.5)
+        return super().step(action)
+
+
+class Stuck(Fine):
+    """Its third step takes a minute if the action is positive, and SIGTERM does not end it."""
+
+    def step(self, action):
+        if self.time == 2 and self.action > 0:
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
+            time.sleep(60)
+        return super().step(action)

@@ -1,7 +1,6 @@
 """An environment that does not answer is reported, and a training says what it is doing."""
 
 import re
-import signal
 import threading
 import time
 
@@ -14,16 +13,7 @@ from beliefrl.training import lockstep
 from beliefrl.training.lockstep import Lockstep
 from beliefrl.training.schedule import Options, _processes, stages
 from worlds import SHARED
-from wrong import Fine, raising
-
-
-class Sleeping(Fine):
-    """Its third step takes long."""
-
-    def step(self, action):
-        if self.time == 2:
-            time.sleep(0.5)
-        return super().step(action)
+from wrong import Fine, Sleeping, Stuck, raising
 
 
 @pytest.mark.parametrize("processes", ["never", pytest.param("always", marks=pytest.mark.slow)])
@@ -44,16 +34,6 @@ def test_a_slow_step_is_reported_once_while_it_goes_on(monkeypatch, processes):
         "robot (step 3): step has not returned for 0 s: it is slow, or it hangs."
     ]
     assert reports[0][0] < ended - 0.1
-
-
-class Stuck(Fine):
-    """Its third step takes a minute if the action is positive, and SIGTERM does not end it."""
-
-    def step(self, action):
-        if self.time == 2 and self.action > 0:
-            signal.signal(signal.SIGTERM, signal.SIG_IGN)
-            time.sleep(60)
-        return super().step(action)
 
 
 def test_a_step_that_takes_too_long_is_a_fault_and_names_the_seed(monkeypatch):
