@@ -83,7 +83,7 @@ LONG += SETTINGS
 def test_a_cluster_trains_what_this_machine_would(tmp_path, head):
     line = f"--agents sac-mlp --tasks pendulum-v pendulum-p --seeds 1 --steps 300 --set eval_every=100 {SETTINGS}"
     process = begin(tmp_path / "there", head, line)
-    output, _ = process.communicate(timeout=300)
+    output, _ = process.communicate(timeout=600)
     assert process.returncode == 0, output
     assert "2 trainings, 2 at a time" in output  # each node has one core, so both nodes worked
     settings = {"eval_every": 100, "eval_episodes": 1, "step_start_rl": 100, "pretrain_updates": 5}
@@ -106,7 +106,7 @@ def test_a_sweep_on_a_cluster_can_be_stopped_and_goes_on(tmp_path, head):
         process = begin(tmp_path, head, line)
         wait_until_it_learns(tmp_path, process, begun)
         process.send_signal(signal.SIGINT)
-        output, _ = process.communicate(timeout=300)
+        output, _ = process.communicate(timeout=600)
         assert process.returncode == 130, output
         assert "stopped with 0 of 1 trainings finished" in output
         (folder,) = (path.parent for path in tmp_path.glob("*/config.json"))
@@ -124,7 +124,7 @@ def test_a_training_whose_worker_dies_goes_on_by_itself(tmp_path, head):
     for worker in out.split():
         with contextlib.suppress(ProcessLookupError):
             os.kill(int(worker), signal.SIGKILL)
-    output, _ = process.communicate(timeout=300)
+    output, _ = process.communicate(timeout=600)
     assert process.returncode == 0, output
     assert "1 of 1 trainings finished" in output
 

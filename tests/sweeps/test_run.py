@@ -11,23 +11,17 @@ from beliefrl.sweeps import run as runs
 from beliefrl.sweeps.plan import Experiment, grid
 from beliefrl.training.stop import Stopped
 from beliefrl.types import UserError
+from written import Places
 
 TWO = grid(["vrm"], ["pendulum", "cartpole"], seeds=2, steps=10)
 
 
-class Pretence:
+class Pretence(Places):
     """Fake trainings that end at once: finished, or failed if their name says so."""
 
     fails = ""
     started = []
     most = 0
-
-    def __init__(self, folder, slots):
-        self.folder, self.slots, self.running = folder, slots, {}
-
-    @property
-    def room(self):
-        return len(self.slots) - len(self.running)
 
     def start(self, training):
         assert self.room > 0

@@ -14,7 +14,7 @@ from beliefrl.sweeps import local, ranges, study
 from beliefrl.sweeps import tune as tuning
 from beliefrl.training.stop import Stopped
 from beliefrl.types import UserError
-from written import a_folder
+from written import Places, a_folder
 
 EVERY = 1000
 BEST = 3e-4  # the learning rate with the highest return; it is the agent's default
@@ -64,18 +64,11 @@ def test_ranges_are_read_from_text():
     assert ranges.from_text("d_size", "8,64") is None
 
 
-class Fake(local.Local):
+class Fake(Places, local.Local):
     """Trainings that make one evaluation at each look: the nearer lr_actor is to BEST, the higher the return."""
 
     started: list = []
     fails = diverges = ""
-
-    def __init__(self, folder, slots):
-        self.folder, self.slots, self.running = folder, slots, {}
-
-    @property
-    def room(self):
-        return len(self.slots) - len(self.running)
 
     def start(self, training):
         Fake.started.append(training)

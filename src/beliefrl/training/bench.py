@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Key
 from beliefrl.agents import Agent
 from beliefrl.training import phases
 from beliefrl.training import replay as ring
-from beliefrl.training.schedule import Options
+from beliefrl.training.schedule import Options, capacity
 from beliefrl.types import Spec, UserError, check_range
 
 PAPER_STEPS = 100_000  # of the wall-clock times in the paper's scalability table
@@ -79,7 +79,8 @@ class _Timed:
 
     def __init__(self, agent: Agent, task: Noise, seeds: int):
         self.agent, self.step = agent, 0
-        self.program = phases.compile_program(agent, task, capacity=2 * PAPER_STEPS // seeds + 2, episodes=1)
+        room = capacity(agent, Options(steps=max(PAPER_STEPS // seeds, agent.step_start_rl)))
+        self.program = phases.compile_program(agent, task, capacity=room, episodes=1)
         self.keys = jax.random.split(jax.random.key(0), seeds)
         self.seeds = jax.block_until_ready(self.program.begin(self.keys))
 
