@@ -114,13 +114,13 @@ def recurrent_ppo(task: str, seed: int, race: Race) -> None:
 
 def memorax_sac(task: str, seed: int, race: Race) -> None:
     """Recurrent SAC of memorax. It needs a critic from us, because memorax 1.0.1 has none that fits its SAC."""
+    import flashbax
     import flax.linen as nn
     import jax
     import jax.numpy as jnp
     import optax
     from gymnax.environments import spaces
     from memorax.algorithms import SAC, SACConfig
-    from memorax.buffers import get_full_start_flags, make_episode_buffer
     from memorax.networks import MLP, RNN, FeatureExtractor, Network, heads
 
     from beliefrl import tasks
@@ -181,8 +181,14 @@ def memorax_sac(task: str, seed: int, race: Race) -> None:
     timing = {"train_frequency": 1, "target_update_frequency": 1, "learning_starts": EXPLORATION}
     config = SACConfig("SAC", **rates, **counts, **timing, initial_alpha=1.0, target_entropy_scale=1.0)
     networks = recurrent(head=heads.SquashedGaussian(actions)), Critic(recurrent(), Q(), Q()), heads.Alpha(1.0)
-    buffer = make_episode_buffer(
-        100_000, EXPLORATION, 32, 64, get_full_start_flags, add_sequences=True, add_batch_size=1
+    # memorax's own buffer draws a sequence in a time that grows with its capacity; this one is of its dependency.
+    buffer = flashbax.make_trajectory_buffer(
+        add_batch_size=1,
+        sample_batch_size=32,
+        sample_sequence_length=64,
+        period=1,
+        min_length_time_axis=EXPLORATION,
+        max_length_time_axis=100_000,
     )
     agent = SAC(config, Environment(), None, *networks, *[optax.adam(3e-4)] * 3, buffer)
 
