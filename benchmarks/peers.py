@@ -31,7 +31,7 @@ class Race:
 
     def __init__(self, task: str, seconds: float):
         self.line, self.budget = LINES[task], seconds
-        self.steps, self.compiling, self.is_over = 0, 0.0, False
+        self.steps, self.compiling, self.has_reached = 0, 0.0, False
         self.evaluations: list[tuple[int, float, float]] = []  # steps, seconds, mean return
         self._counted, self._since = 0.0, time.perf_counter()  # seconds up to the last pause; None: it stands still
 
@@ -39,20 +39,24 @@ class Race:
     def seconds(self) -> float:
         return self._counted + (0.0 if self._since is None else time.perf_counter() - self._since)
 
+    @property
+    def is_over(self) -> bool:
+        return self.has_reached or self.seconds > self.budget
+
     def pause(self) -> None:
         """Stop the clock, before an evaluation."""
         self._counted, self._since = self.seconds, None
 
     def record(self, mean: float) -> None:
-        """Start the clock again, after an evaluation with this mean return."""
-        self.evaluations.append((self.steps, round(self._counted, 2), float(mean)))
-        self.is_over = self.is_over or mean > self.line
+        """Start the clock again, after an evaluation with this mean return. After the race it does not count."""
+        if not self.is_over:
+            self.evaluations.append((self.steps, round(self._counted, 2), float(mean)))
+            self.has_reached = bool(mean > self.line)
         self._since = time.perf_counter()
 
     def at(self, steps: int) -> bool:
         """Note how far the training is; returns whether the race is over."""
         self.steps = steps
-        self.is_over = self.is_over or self.seconds > self.budget
         return self.is_over
 
     @property
