@@ -46,7 +46,9 @@ def play(policy, session, batch, steps=8):
         yield action, other
 
 
-@pytest.mark.parametrize("name", AGENTS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name == "vrm" else ()) for name in AGENTS]
+)
 def test_the_model_acts_as_the_policy_does_for_any_batch_size(name, tmp_path):
     pytest.importorskip("onnx")
     policy = a_policy(name)
@@ -59,6 +61,7 @@ def test_the_model_acts_as_the_policy_does_for_any_batch_size(name, tmp_path):
             np.testing.assert_allclose(theirs, ours, rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_statistics_and_optional_inputs_are_in_the_model():
     pytest.importorskip("onnx")
     for name, settings in (("sac-mlp", {"standardise": True}), ("sac-lstm", {"perceive_action": True})):
@@ -83,6 +86,7 @@ def test_an_agent_whose_empty_memory_is_not_zero_begins_with_it():
     assert session.run(["next_state_0"], given)[0] == CountingAgent.empty + 1
 
 
+@pytest.mark.slow
 def test_the_command_compares_in_an_episode_of_the_task(tmp_path, capsys):
     pytest.importorskip("onnx")
     run = saved(tmp_path / "run", "sac-lstm", TASK)

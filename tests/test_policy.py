@@ -190,7 +190,9 @@ assert "beliefrl" not in sys.modules
 """
 
 
-@pytest.mark.parametrize("name", ["vrm", pytest.param("slac", marks=pytest.mark.nightly)])
+@pytest.mark.parametrize(
+    "name", [pytest.param("vrm", marks=pytest.mark.slow), pytest.param("slac", marks=pytest.mark.nightly)]
+)
 def test_the_export_acts_the_same_with_jax_alone(name, tmp_path):
     policy = Policy(*_with_spec(name))
     policy.export(tmp_path / "policy.jax")

@@ -55,7 +55,7 @@ def test_pairs_across_episodes_enter_no_loss(state):
     assert not np.allclose(one.step.obs[:, 2], other.step.obs[:, 2])
 
 
-@pytest.mark.parametrize("agent", [AGENT, STANDARDISED])
+@pytest.mark.parametrize("agent", [AGENT, pytest.param(STANDARDISED, marks=pytest.mark.nightly)])
 def test_pretraining_is_an_update_of_the_controller(agent):
     window, state = windows(jax.random.key(1), 6, 2), begun(agent)
     after, _ = jax.jit(agent.pretrain)(state, window, jax.random.key(2))

@@ -46,6 +46,7 @@ def recorded(folder):
     assert "trap" not in sys.modules
 
 
+@pytest.mark.slow
 def test_it_is_trained_resumed_and_read(folder, capsys):
     cli.main([*TRAIN.split(), "--steps", "20", "--cycle", "2"])
     out = " ".join(capsys.readouterr().out.split())

@@ -166,7 +166,7 @@ def test_pictures_and_success_are_of_the_true_state():
     assert [counting.step(np.zeros(1))[-1]["is_success"] for _ in range(5)] == [False] * 4 + [True]
 
 
-@both
+@pytest.mark.parametrize("kind", [pytest.param("compiled", marks=pytest.mark.slow), "host"])
 def test_runs_are_evaluated_and_played_with_their_faults(kind, tmp_path):
     faults = Faults(sticky=1.0, flicker_flag=True)
     task = GymnasiumTask(HostEcho, max_steps=9, faults=faults) if kind == "host" else with_faults(Echo(), faults)

@@ -163,7 +163,8 @@ def lowered(monkeypatch):
     return texts
 
 
-@pytest.mark.parametrize("precision", ASKED)
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", ["float32", pytest.param("tensorfloat32", marks=pytest.mark.nightly)])
 def test_it_reaches_every_phase_and_a_resumed_run_keeps_it(tmp_path, lowered, precision):
     train(AGENT, "pendulum-v", tmp_path / "run", precision=precision, **OPTIONS)
     both = {(ASKED[precision],) * 2}
@@ -174,7 +175,10 @@ def test_it_reaches_every_phase_and_a_resumed_run_keeps_it(tmp_path, lowered, pr
     assert json.loads((run.folder / "config.json").read_text())["options"]["precision"] == precision
 
 
-@pytest.mark.parametrize("precision", [*ASKED, None])
+@pytest.mark.parametrize(
+    "precision",
+    [pytest.param("float32", marks=pytest.mark.slow), pytest.param("tensorfloat32", marks=pytest.mark.nightly), None],
+)
 def test_what_is_made_of_a_run_has_its_precision(tmp_path, monkeypatch, precision):
     """None: of a run that was made before there was a choice."""
     run = saved(tmp_path / "run", "vrm", tasks.make("pendulum-v", max_steps=3))

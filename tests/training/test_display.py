@@ -76,6 +76,7 @@ def test_a_log_gets_a_line_where_nothing_else_was_printed_for_a_minute(run, monk
     assert said(display.screen.console.file.getvalue()) == lines
 
 
+@pytest.mark.slow
 def test_a_training_from_python_shows_its_phases_and_evaluations(tmp_path, capsys):
     train(AGENT, "pendulum", tmp_path / "run", **OPTIONS)
     out = capsys.readouterr().out
@@ -86,6 +87,7 @@ def test_a_training_from_python_shows_its_phases_and_evaluations(tmp_path, capsy
     assert f"saved in {tmp_path / 'run'}:" in out
 
 
+@pytest.mark.slow
 def test_without_progress_nothing_is_shown_and_a_callback_gets_the_events(tmp_path, capsys):
     events = []
     run = train(AGENT, "pendulum", tmp_path / "run", callback=events.append, progress=False, **OPTIONS)
@@ -94,6 +96,7 @@ def test_without_progress_nothing_is_shown_and_a_callback_gets_the_events(tmp_pa
     assert [event.step for event in events if event.evaluation is not None] == [20, 40]
 
 
+@pytest.mark.slow
 def test_an_evaluation_that_takes_seconds_shows_how_many_episodes_are_over(tmp_path, capsys, monkeypatch):
     run = train(AGENT, GymnasiumTask(Fine), tmp_path / "run", progress=False, **OPTIONS)
     patient = screens.screen

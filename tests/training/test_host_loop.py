@@ -155,7 +155,7 @@ def few(**changes):
     return {"steps": 40, "eval_every": 20, "eval_episodes": 2, "seeds": 2, "seed": 5} | changes
 
 
-@pytest.mark.parametrize("episodes", [2, 3])
+@pytest.mark.parametrize("episodes", [2, pytest.param(3, marks=pytest.mark.nightly)])
 def test_a_training_goes_on_from_a_fault(tmp_path, episodes):
     """With two episodes its environment fails at step 27 of the training, with three in the first evaluation."""
     agent, notes = agents.make("sac-mlp", **SHARED, **SMALL["sac-mlp"]), []

@@ -45,6 +45,7 @@ def test_other_sizes_are_one_sentence_and_no_folder(source, tmp_path, agent, tas
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_a_training_starts_there_without_pretraining_and_needs_the_other_run_no_more(source, tmp_path):
     networks = arrays.load(source.agents())
     states, phases = [], []

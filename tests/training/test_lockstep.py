@@ -72,6 +72,7 @@ def test_a_training_reports_a_slow_step(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("task", ["pendulum-v", GymnasiumTask(Fine)], ids=["compiled", "host"])
+@pytest.mark.slow
 def test_what_is_shown_is_what_is_done(task):
     """No phase is shown that the agent does not have, and an environment acts only in a phase that says so."""
     from beliefrl import tasks

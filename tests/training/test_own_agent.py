@@ -64,6 +64,7 @@ def test_whatever_reads_a_run_takes_it(run, tmp_path):
     np.testing.assert_array_equal(predicted.errors()[1], 0.0)
 
 
+@pytest.mark.slow
 def test_it_is_resumed(run, tmp_path):
     folder = tmp_path / "run"
     before = beliefrl.train(Foreteller(), "pendulum-p", folder, **OPTIONS)
@@ -184,6 +185,7 @@ class Diverging(Undefined):
 SHORT = {"steps": 14, "seeds": 1, "eval_every": 14, "eval_episodes": 1}
 
 
+@pytest.mark.slow
 def test_a_metric_that_is_no_loss_may_be_undefined_and_a_loss_may_not(tmp_path):
     run = beliefrl.train(Undefined(), Counting(), tmp_path / "undefined", **SHORT)
     (row,) = run.rows(0, "update")
@@ -228,7 +230,10 @@ class WalkingEnvironment(Counter):
         return *step, info | ({"metres": self.steps} if self.steps % 2 else {})
 
 
-@pytest.mark.parametrize("task", [Walk(), GymnasiumTask(WalkingEnvironment, max_steps=7, measures=("metres",))])
+WALKING = GymnasiumTask(WalkingEnvironment, max_steps=7, measures=("metres",))
+
+
+@pytest.mark.parametrize("task", [Walk(), pytest.param(WALKING, marks=pytest.mark.slow)])
 def test_a_measure_is_logged_evaluated_shown_and_drawn(task, tmp_path, capsys):
     options = {"steps": 14, "seeds": 2, "eval_every": 7, "eval_episodes": 2}
     run = beliefrl.train(CountingAgent(), task, tmp_path / "run", **options)

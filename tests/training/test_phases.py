@@ -52,6 +52,7 @@ def doubles():
 
 
 @pytest.mark.usefixtures("doubles")
+@pytest.mark.slow
 def test_a_seed_among_others_learns_as_it_does_alone_up_to_rounding(small):
     program, cycle = small
     keys = jax.random.split(jax.random.key(0), 3)
@@ -126,6 +127,7 @@ def counting(steps=120, task=None):
     return seeds, told, counts
 
 
+@pytest.mark.slow
 def test_every_window_of_a_training_is_unbroken():
     """The counter that the task shows is the agent's own count, through memory, resets, replay and its wrapping."""
     for task in (Counting(max_steps=7), Counting(ends=3), Counting(ends=1), Counting(max_steps=50)):

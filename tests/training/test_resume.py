@@ -110,7 +110,7 @@ LINE += " --checkpoint-steps 1 --resume --out"
     ("command", "left"),
     [
         ("resume", "a log and half a checkpoint"),
-        ("train --resume", "a log"),
+        pytest.param("train --resume", "a log", marks=pytest.mark.slow),
         pytest.param("train --resume", "no config", marks=pytest.mark.nightly),
         pytest.param("train", "a log", marks=pytest.mark.nightly),
         pytest.param("python", "a log", marks=pytest.mark.slow),
@@ -172,6 +172,7 @@ def test_every_agent_goes_on_to_the_last_bit(tmp_path, name):
     assert files(tmp_path / "run") == files(tmp_path / "whole")
 
 
+@pytest.mark.slow
 def test_train_goes_on_where_it_is_asked_to(whole, tmp_path):
     folder = tmp_path / "run"
     with pytest.raises(Crash):
@@ -221,6 +222,7 @@ def test_where_the_checkpoints_are_gone_there_is_a_sentence(whole, tmp_path):
         resume(tmp_path / "nowhere")
 
 
+@pytest.mark.slow
 def test_a_training_that_fails_before_it_saved_anything_blocks_nothing(tmp_path):
     folder = tmp_path / "run"
     for number in (1, 5, 9):  # an event of the making, the exploration and the pre-training
@@ -245,6 +247,7 @@ def test_a_run_that_is_being_trained_is_not_touched(whole):
     resume(folder)
 
 
+@pytest.mark.slow
 def test_a_log_that_was_cut_is_told(whole, tmp_path):
     with pytest.raises(Crash):
         train(AGENT, "pendulum-v", tmp_path / "run", crash_at(whole[1] - 2), **OPTIONS)
@@ -268,9 +271,10 @@ def test_an_environment_goes_on_from_the_start_of_an_episode(tmp_path):
     ("what", "why"),
     [
         ("networks", "its networks are not finite"),
-        pytest.param("loss_q", "loss_q is not finite", marks=pytest.mark.slow),
+        ("loss_q", "loss_q is not finite"),
     ],
 )
+@pytest.mark.slow
 def test_a_seed_that_diverges_stops_alone(tmp_path, monkeypatch, what, why):
     """The second seed's networks, or a loss of it, are made NaN after step 120."""
     from beliefrl.training import phases
@@ -328,6 +332,7 @@ def test_the_first_signal_is_a_checkpoint_and_a_word_how_to_go_on(whole, tmp_pat
     assert files(tmp_path / "run") == files(folder)
 
 
+@pytest.mark.slow
 def test_a_callback_stops_a_training_that_goes_on_to_the_last_bit(whole, tmp_path):
     notes = []
 
@@ -346,6 +351,7 @@ def test_a_callback_stops_a_training_that_goes_on_to_the_last_bit(whole, tmp_pat
     assert files(run.folder) == files(whole[0])
 
 
+@pytest.mark.slow
 def test_a_training_ends_where_every_seed_has_reached_the_line(whole, tmp_path):
     first = [np.mean(next(Run(whole[0]).rows(seed, "evaluation"))["sampled"]) for seed in range(2)]
     folder, notes = tmp_path / "run", []
@@ -378,6 +384,7 @@ def test_trainings_in_other_threads_leave_signals_alone(tmp_path):
     assert not failed
 
 
+@pytest.mark.slow
 def test_constants_that_are_tuples_are_the_same_when_a_run_goes_on(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     line = "train sac-mlp target-reaching --steps 4 --eval-episodes 1 --constants max_steps=2 --out run --resume"

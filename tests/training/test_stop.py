@@ -206,7 +206,7 @@ Recorder("run", None).close()  # it is locked no more
 """
 
 
-MARKS = {"metrics": (), "checkpoint": pytest.mark.slow}
+MARKS = {"metrics": pytest.mark.slow, "checkpoint": pytest.mark.slow}
 
 
 @pytest.mark.parametrize("file", [pytest.param(name, marks=MARKS.get(name, pytest.mark.nightly)) for name in FILES])

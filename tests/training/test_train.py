@@ -122,6 +122,7 @@ def test_a_training_is_evaluated_in_both_modes(trained):
     assert "saved in" in table.splitlines()[-2] + table.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_evaluate_prints_one_object_and_the_same_for_the_same_seed(trained):
     folder, _ = trained
     command = program("evaluate", folder, "--episodes", 3, "--json")
@@ -138,6 +139,7 @@ def test_evaluate_prints_one_object_and_the_same_for_the_same_seed(trained):
         assert result[mode]["success"] is None
 
 
+@pytest.mark.slow
 def test_python_gives_the_metrics_of_the_command_line(trained, tmp_path):
     folder, _ = trained
     script = f"""

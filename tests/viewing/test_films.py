@@ -133,6 +133,7 @@ def test_a_strip_has_a_row_for_each_run(tmp_path, run):
     assert (run.folder / "film.pdf").read_bytes().startswith(b"%PDF")
 
 
+@pytest.mark.slow
 def test_the_commands_write_their_files(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     saved(tmp_path / "run", "slac", TASK)
