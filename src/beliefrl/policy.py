@@ -29,7 +29,7 @@ from beliefrl.tasks import Task
 from beliefrl.tasks.environment import TaskEnvironment
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.evaluation import restore_seed
-from beliefrl.types import LARGEST, Spec, Timestep, UserError, short
+from beliefrl.types import LARGEST, Spec, Timestep, UserError, as_array, short
 
 State = tuple[np.ndarray, ...]
 
@@ -245,7 +245,7 @@ def _numbers(value: Any, name: str) -> np.ndarray:
     Raises:
         UserError: an entry is not a number.
     """
-    array = _array(value)
+    array = as_array(value)
     for index, entry in np.ndenumerate(array if array.dtype == object else ()):
         if not isinstance(entry, Real):
             raise UserError(f"{_place(name, index)} is {short(entry)}: give finite numbers.")
@@ -254,17 +254,9 @@ def _numbers(value: Any, name: str) -> np.ndarray:
     return array
 
 
-def _array(value: Any) -> np.ndarray:
-    """The value as an array; an empty array if it cannot be one."""
-    try:
-        return np.asarray(value)
-    except Exception:  # rows of different lengths, or an error of the value's class
-        return np.empty(0, object)
-
-
 def _flags(value: Any, batch: int, name: str) -> np.ndarray:
     """One bool for each episode of a batch."""
-    array = _array(value)
+    array = as_array(value)
     if array.dtype.kind not in "biu" or not np.isin(array, (0, 1)).all():
         raise UserError(f"{name} must be True or False, not {short(value)}.")
     return _each(array.astype(bool), batch, name)

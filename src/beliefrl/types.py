@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from beliefrl.errors import UserError as UserError
@@ -71,6 +72,14 @@ def tuples(values: Mapping[str, Any]) -> dict[str, Any]:
         return tuple(map(frozen, value)) if isinstance(value, list) else value
 
     return {name: frozen(value) for name, value in values.items()}
+
+
+def as_array(value: Any) -> np.ndarray:
+    """The value as an array; an empty array of objects if it cannot be one."""
+    try:
+        return np.asarray(value)
+    except Exception:  # rows of different lengths, or an error of the value's class
+        return np.empty(0, object)
 
 
 def check_choice(settings: object, name: str, choices: Sequence[str | bool]) -> None:

@@ -16,7 +16,7 @@ from gymnasium import spaces
 from beliefrl.tasks.faults import NONE, STREAM, Draws, Faults
 from beliefrl.tasks.labels import observation_names
 from beliefrl.tasks.spaces import check_actions, flat_bounds, flat_size, limits
-from beliefrl.types import LARGEST, Spec, UserError, check_indices, check_range, said, short
+from beliefrl.types import LARGEST, Spec, UserError, as_array, check_indices, check_range, said, short
 
 ENDLESS = 10_000  # steps after which an episode without a time limit is considered endless
 
@@ -205,7 +205,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         """The entries that the agent observes, as float32, after all checks."""
         space = self.inner_observation_space
         if isinstance(space, spaces.Box):
-            value = _array(obs)
+            value = as_array(obs)
             if value.dtype.kind not in "biuf":
                 raise self._fault(f"the observation has type {value.dtype}, but its space says {space.dtype}")
             if value.shape != space.shape:
@@ -234,7 +234,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         return flat
 
     def _number(self, reward: Any) -> float:
-        value = _array(reward)
+        value = as_array(reward)
         if value.shape != () or value.dtype.kind not in "biuf":
             shown = f"of shape {value.shape}" if value.shape else repr(reward)
             raise self._fault(f"the reward is {shown}, but must be one number")
@@ -296,10 +296,3 @@ def measure_of(info: Any, name: str) -> float | None:
     except (TypeError, ValueError):
         return None
     return number if np.isfinite(number) else None
-
-
-def _array(value: Any) -> np.ndarray:
-    try:
-        return np.asarray(value)
-    except ValueError:  # rows of different lengths
-        return np.empty(0, object)
