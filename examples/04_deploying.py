@@ -2,7 +2,7 @@
 
     pip install -c constraints.txt -e .             # in a clone of the repository
     beliefrl train vrm gym:Pendulum-v1 --observe 2 --steps 10000 --out runs/pendulum
-    python examples/04_deploying.py runs/pendulum     # any run will do
+    python examples/04_deploying.py runs/pendulum     # a run on a Gymnasium environment: 12 s of CPU time
     python examples/04_deploying.py --quick           # trains a small agent first: 30 s of CPU time
 
 Inputs and outputs are numpy arrays. `state` is the recurrent memory: pass it to the next call, or None at the start of

@@ -46,9 +46,7 @@ def play(policy, session, batch, steps=8):
         yield action, other
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow if name == "vrm" else ()) for name in AGENTS]
-)
+@pytest.mark.parametrize("name", [pytest.param("vrm", marks=pytest.mark.slow), *AGENTS[1:]])
 def test_the_model_acts_as_the_policy_does_for_any_batch_size(name, tmp_path):
     pytest.importorskip("onnx")
     policy = a_policy(name)

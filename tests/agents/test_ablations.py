@@ -25,7 +25,7 @@ def made(name):
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(name, marks=pytest.mark.slow if name == "vrm-single" else pytest.mark.nightly) for name in MODELS],
+    [pytest.param(name, marks=pytest.mark.nightly) for name in MODELS],
 )
 def test_it_has_its_models_and_each_learns_in_its_time(name):
     agent, state, window = made(name)

@@ -116,6 +116,7 @@ def test_a_sweep_on_a_cluster_can_be_stopped_and_goes_on(tmp_path, head):
         begun = last_step(tmp_path)
 
 
+@pytest.mark.nightly
 def test_a_training_whose_worker_dies_goes_on_by_itself(tmp_path, head):
     process = begin(tmp_path, head, LONG)
     wait_until_it_learns(tmp_path, process)

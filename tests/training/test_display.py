@@ -96,7 +96,7 @@ def test_without_progress_nothing_is_shown_and_a_callback_gets_the_events(tmp_pa
     assert [event.step for event in events if event.evaluation is not None] == [20, 40]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_an_evaluation_that_takes_seconds_shows_how_many_episodes_are_over(tmp_path, capsys, monkeypatch):
     run = train(AGENT, GymnasiumTask(Fine), tmp_path / "run", progress=False, **OPTIONS)
     patient = screens.screen

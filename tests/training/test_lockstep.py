@@ -71,7 +71,9 @@ def test_a_training_reports_a_slow_step(monkeypatch, tmp_path):
     assert "robot (step 3): step has not returned for 0 s: it is slow, or it hangs." in notes
 
 
-@pytest.mark.parametrize("task", ["pendulum-v", GymnasiumTask(Fine)], ids=["compiled", "host"])
+@pytest.mark.parametrize(
+    "task", ["pendulum-v", pytest.param(GymnasiumTask(Fine), marks=pytest.mark.nightly)], ids=["compiled", "host"]
+)
 @pytest.mark.slow
 def test_what_is_shown_is_what_is_done(task):
     """No phase is shown that the agent does not have, and an environment acts only in a phase that says so."""

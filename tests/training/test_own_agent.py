@@ -233,7 +233,7 @@ class WalkingEnvironment(Counter):
 WALKING = GymnasiumTask(WalkingEnvironment, max_steps=7, measures=("metres",))
 
 
-@pytest.mark.parametrize("task", [Walk(), pytest.param(WALKING, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("task", [Walk(), pytest.param(WALKING, marks=pytest.mark.nightly)])
 def test_a_measure_is_logged_evaluated_shown_and_drawn(task, tmp_path, capsys):
     options = {"steps": 14, "seeds": 2, "eval_every": 7, "eval_episodes": 2}
     run = beliefrl.train(CountingAgent(), task, tmp_path / "run", **options)

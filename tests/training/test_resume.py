@@ -110,7 +110,7 @@ LINE += " --checkpoint-steps 1 --resume --out"
     ("command", "left"),
     [
         ("resume", "a log and half a checkpoint"),
-        pytest.param("train --resume", "a log", marks=pytest.mark.slow),
+        pytest.param("train --resume", "a log", marks=pytest.mark.nightly),
         pytest.param("train --resume", "no config", marks=pytest.mark.nightly),
         pytest.param("train", "a log", marks=pytest.mark.nightly),
         pytest.param("python", "a log", marks=pytest.mark.slow),
