@@ -59,7 +59,7 @@ def test_the_model_acts_as_the_policy_does_for_any_batch_size(name, tmp_path):
             np.testing.assert_allclose(theirs, ours, rtol=0, atol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_statistics_and_optional_inputs_are_in_the_model():
     pytest.importorskip("onnx")
     for name, settings in (("sac-mlp", {"standardise": True}), ("sac-lstm", {"perceive_action": True})):

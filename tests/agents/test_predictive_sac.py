@@ -105,7 +105,7 @@ def test_pretraining_teaches_the_model_to_predict(state):
     assert losses[-1] < 0.1 * losses[0]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_what_does_not_exist_changes_nothing(state):
     exists = jnp.ones((2, TIME), bool).at[0, :3].set(False).at[1, -2:].set(False)
     first = jnp.zeros((2, TIME), bool).at[0, 3].set(True).at[1, 0].set(True)  # as the replay marks the oldest timestep

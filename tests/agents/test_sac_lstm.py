@@ -109,7 +109,7 @@ def test_gradients_of_three_losses_reach_the_lstm_and_none_through_targets(state
     assert along(grad_actor, direction) == pytest.approx(grad_pi, rel=0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_target_lstm_is_what_the_target_value_reads(state):
     window, key = windows(jax.random.key(1), 2, TIME), jax.random.key(2)
     other = jax.tree.map(lambda leaf: leaf + 0.1, state.lstm)

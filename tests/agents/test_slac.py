@@ -100,7 +100,7 @@ def test_the_gradient_of_the_elbo_agrees_with_finite_differences(state):
     assert along(gradient, direction) == pytest.approx(slope(loss, state.model, direction, by=3e-3), rel=0.03)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_pretraining_trains_the_model_alone_and_an_update_the_controller_alone(state):
     window = windows(jax.random.key(1), 4, TIME)
     after, _ = jax.jit(AGENT.pretrain)(state, jax.tree.map(lambda leaf: leaf[:, :2], window), jax.random.key(2))

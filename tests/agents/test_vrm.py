@@ -221,7 +221,7 @@ def test_beliefs_of_means_are_without_noise_where_it_acts_and_where_it_learns(st
     assert differ(*(act(state, memory, step, jax.random.key(k), jnp.array(True))[0] for k in (1, 2)))  # still samples
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_standardised_beliefs_are_what_the_controller_learns_from_and_acts_on(state):
     agent, window = dataclasses.replace(AGENT, standardise=True), windows(jax.random.key(1), 12)
     fresh = state._replace(scale=initial_statistics(2 * AGENT.d_size + SPEC.obs_dim + 1))
@@ -237,7 +237,7 @@ def test_standardised_beliefs_are_what_the_controller_learns_from_and_acts_on(st
     np.testing.assert_allclose(action, agent.choose(after.controller, belief, jax.random.key(3), mode), rtol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_decoding_from_the_prior_and_sums_are_other_losses(state):
     window = windows(jax.random.key(1), 2)
     loss = {

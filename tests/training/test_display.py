@@ -76,7 +76,7 @@ def test_a_log_gets_a_line_where_nothing_else_was_printed_for_a_minute(run, monk
     assert said(display.screen.console.file.getvalue()) == lines
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_training_from_python_shows_its_phases_and_evaluations(tmp_path, capsys):
     train(AGENT, "pendulum", tmp_path / "run", **OPTIONS)
     out = capsys.readouterr().out

@@ -74,7 +74,7 @@ def test_a_training_reports_a_slow_step(monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     "task", ["pendulum-v", pytest.param(GymnasiumTask(Fine), marks=pytest.mark.nightly)], ids=["compiled", "host"]
 )
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_what_is_shown_is_what_is_done(task):
     """No phase is shown that the agent does not have, and an environment acts only in a phase that says so."""
     from beliefrl import tasks

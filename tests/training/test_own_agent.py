@@ -185,7 +185,7 @@ class Diverging(Undefined):
 SHORT = {"steps": 14, "seeds": 1, "eval_every": 14, "eval_episodes": 1}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_metric_that_is_no_loss_may_be_undefined_and_a_loss_may_not(tmp_path):
     run = beliefrl.train(Undefined(), Counting(), tmp_path / "undefined", **SHORT)
     (row,) = run.rows(0, "update")

@@ -127,7 +127,7 @@ def counting(steps=120, task=None):
     return seeds, told, counts
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_every_window_of_a_training_is_unbroken():
     """The counter that the task shows is the agent's own count, through memory, resets, replay and its wrapping."""
     for task in (Counting(max_steps=7), Counting(ends=3), Counting(ends=1), Counting(max_steps=50)):

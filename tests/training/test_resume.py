@@ -222,7 +222,7 @@ def test_where_the_checkpoints_are_gone_there_is_a_sentence(whole, tmp_path):
         resume(tmp_path / "nowhere")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_training_that_fails_before_it_saved_anything_blocks_nothing(tmp_path):
     folder = tmp_path / "run"
     for number in (1, 5, 9):  # an event of the making, the exploration and the pre-training
@@ -247,7 +247,7 @@ def test_a_run_that_is_being_trained_is_not_touched(whole):
     resume(folder)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_log_that_was_cut_is_told(whole, tmp_path):
     with pytest.raises(Crash):
         train(AGENT, "pendulum-v", tmp_path / "run", crash_at(whole[1] - 2), **OPTIONS)
@@ -384,7 +384,7 @@ def test_trainings_in_other_threads_leave_signals_alone(tmp_path):
     assert not failed
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_constants_that_are_tuples_are_the_same_when_a_run_goes_on(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     line = "train sac-mlp target-reaching --steps 4 --eval-episodes 1 --constants max_steps=2 --out run --resume"

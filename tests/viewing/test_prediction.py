@@ -159,7 +159,7 @@ def test_a_prediction_stands_beside_the_truth_of_its_time(tmp_path, monkeypatch)
     assert predicted.title == "slac on pendulum-p, seed 4: latent model"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_short_episode_is_seen_to_its_half(tmp_path):
     predicted = few(saved(tmp_path / "run", "vrm-keep", TASK), start=None, horizon=100)
     assert predicted.start == 6
