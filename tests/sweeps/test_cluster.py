@@ -80,6 +80,7 @@ LONG = "--agents sac-mlp --tasks pendulum-v --seeds 1 --steps 12000 --set eval_e
 LONG += SETTINGS
 
 
+@pytest.mark.nightly
 def test_a_cluster_trains_what_this_machine_would(tmp_path, head):
     line = f"--agents sac-mlp --tasks pendulum-v pendulum-p --seeds 1 --steps 300 --set eval_every=100 {SETTINGS}"
     process = begin(tmp_path / "there", head, line)
@@ -100,6 +101,7 @@ def last_step(folder):
     return json.loads(text.rpartition("\n")[0].splitlines()[-1])["step"]  # the last line may be half written
 
 
+@pytest.mark.nightly
 def test_a_sweep_on_a_cluster_can_be_stopped_and_goes_on(tmp_path, head):
     begun = 0
     for line in (LONG.replace("12000", "1000000"), ""):  # far more steps than are made before it stops
