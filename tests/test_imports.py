@@ -88,7 +88,7 @@ def test_entry_points_are_listed_without_an_import(tmp_path, monkeypatch):
     assert "never_imported" not in sys.modules
 
 
-def test_names_that_could_not_be_told_from_others_are_left_out(tmp_path, monkeypatch):
+def test_names_that_cannot_be_distinguished_are_left_out(tmp_path, monkeypatch):
     lines = "a:b = m:A\nc d = m:A\n\x1b[31mred = m:A\nfine-1.0 = m:A [extra]\n"
     installed(tmp_path, monkeypatch, "beliefrl.agents", lines)
     assert imports.declared("beliefrl.agents") == {"fine-1.0": "m:A"}

@@ -23,10 +23,8 @@ def made(name):
     return agent, state, window._replace(note=notes)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=pytest.mark.nightly) for name in MODELS],
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", MODELS)
 def test_it_has_its_models_and_each_learns_in_its_time(name):
     agent, state, window = made(name)
     there = MODELS[name].split()

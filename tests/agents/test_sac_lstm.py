@@ -150,7 +150,7 @@ def test_timesteps_that_do_not_exist_enter_no_loss(state):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), *results)
 
 
-def test_it_perceives_what_it_is_told_to():
+def test_it_perceives_what_its_options_name():
     for more, size in (({}, 3), ({"perceive_action": True}, 5), ({"perceive_reward": True}, 4)):
         agent = dataclasses.replace(AGENT, **more)
         state = jax.eval_shape(lambda key, agent=agent: agent.init(key, SPEC), jax.random.key(0))

@@ -67,10 +67,10 @@ def test_inference_and_elbo_are_the_equations(state, timesteps, noise):
     for t in range(6):
         first = np.asarray(step.is_first[t])[:, None]
         before = np.where(first, 0.0, before)
-        action, told = np.asarray(step.prev_action[t]), first.astype(float)
-        mean, sigma = gaussian(model.posterior, np.asarray(perception(step)[t]), told, action, before)
+        action, begins = np.asarray(step.prev_action[t]), first.astype(float)
+        mean, sigma = gaussian(model.posterior, np.asarray(perception(step)[t]), begins, action, before)
         z1 = mean + sigma * noise[0][t]
-        z2_mean, z2_sigma = gaussian(model.next_z2, told, action, z1, before)
+        z2_mean, z2_sigma = gaussian(model.next_z2, begins, action, z1, before)
         z2 = z2_mean + z2_sigma * noise[1][t]
         prior_mean, prior_sigma = (
             np.where(first, default, part)

@@ -99,7 +99,7 @@ def test_of_a_task_without_a_known_good_return_nobody_says_that_it_is_solved(tmp
     assert row[6] == "-"
 
 
-def test_success_is_told_where_a_task_has_it_and_an_unknown_time_is_unknown(tmp_path):
+def test_success_is_shown_where_a_task_has_it_and_an_unknown_time_is_unknown(tmp_path):
     seed = [(10, [1.0, 3.0], [True, False])]
     (row,) = rows(groups([a_run(tmp_path / "a", [seed], task="target-reaching")]))
     assert row[4] == "2.0; success 50%"

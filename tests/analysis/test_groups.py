@@ -112,7 +112,7 @@ def test_a_run_without_its_logs_is_still_a_run(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["missing", "empty", "x" * 300])
-def test_a_folder_without_runs_is_told(tmp_path, name):
+def test_a_folder_without_runs_is_an_error(tmp_path, name):
     (tmp_path / "empty").mkdir()
     with pytest.raises(UserError, match=r"There is no (folder|run in)"):
         find([tmp_path / name])

@@ -82,7 +82,7 @@ def test_both_files_are_written(two_tasks, tmp_path):
     assert path.with_suffix(".pdf").read_bytes().startswith(b"%PDF")
 
 
-def test_nothing_to_draw_is_told(tmp_path):
+def test_nothing_to_draw_is_an_error(tmp_path):
     with pytest.raises(UserError, match="no curve to draw"):
         panels.draw_curves(groups([a_run(tmp_path / "a", [[]])]), tmp_path / "picture")
 

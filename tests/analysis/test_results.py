@@ -118,13 +118,13 @@ def test_where_runs_lay_on_this_machine_is_not_kept(tmp_path):
     ],
     ids=["no gzip", "no json", "empty", "no dates", "cut"],  # gzip's content has the time in it: no name of a test
 )
-def test_a_file_of_another_kind_is_told(tmp_path, content):
+def test_a_file_of_another_kind_is_an_error(tmp_path, content):
     (tmp_path / "kept.json.gz").write_bytes(content)
     with pytest.raises(UserError, match="cannot be read as a file of results"):
         groups.find([tmp_path / "kept.json.gz"])
 
 
-def test_a_missing_file_and_one_of_a_later_version_are_told(tmp_path):
+def test_a_missing_file_and_one_of_a_later_version_are_errors(tmp_path):
     with pytest.raises(UserError, match="There is no file"):
         groups.find([tmp_path / "kept.json.gz"])
     (tmp_path / "kept.json.gz").write_bytes(gzip.compress(b'{"format": 2}'))

@@ -79,7 +79,7 @@ def test_a_truncated_episode_bootstraps_from_its_last_timestep_and_a_terminated_
 @pytest.mark.parametrize(
     "name", ["sac-mlp", *(pytest.param(name, marks=pytest.mark.nightly) for name in ("vrm", "sac-lstm", "slac"))]
 )
-def test_every_agent_learns_from_n_steps_and_as_often_as_it_is_told(name):
+def test_every_agent_learns_from_n_steps_and_as_often_as_its_options_say(name):
     settings = {"policy_layers": (8,), "value_layers": (8,), "batch_size": 2}
     settings |= {
         "vrm": {**SMALL, "store_first_impression": False},
@@ -106,7 +106,7 @@ def first(batches):
     return jax.tree.map(lambda leaf: leaf[0], batches)
 
 
-def test_values_start_where_they_are_told():
+def test_values_start_where_the_option_says():
     @jax.jit
     def values(key):
         controller = agents.make("sac-mlp", value_start=100.0).init(key, SPEC).controller

@@ -256,7 +256,7 @@ def test_no_pickle_is_ever_loaded(three, monkeypatch):
 
 
 @pytest.mark.parametrize("place", ["state.safetensors", "manifest.json", "000004.safetensors"])
-def test_a_full_disk_is_told_and_the_last_good_one_stands(three, monkeypatch, place):
+def test_a_full_disk_is_an_error_and_the_last_good_one_stands(three, monkeypatch, place):
     folder, rings = three
     checkpoints, ring = Checkpoints(folder, keep=3), Ring()
     checkpoints.restore(tree(), ring.timesteps)

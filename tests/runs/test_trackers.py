@@ -54,7 +54,7 @@ def recorder(folder, track, config=CONFIG):
     return Recorder(folder, config and {**config, "options": options})
 
 
-def test_trackers_are_told_numbers_and_means_of_lists(tmp_path, heard):
+def test_trackers_get_numbers_and_means_of_lists(tmp_path, heard):
     run = recorder(tmp_path / "run", ["tensorboard", "wandb"])
     run.log(1, "evaluation", 10, {"sampled": [1.0, 3.0], "why": "words"})
     run.close()
@@ -64,7 +64,7 @@ def test_trackers_are_told_numbers_and_means_of_lists(tmp_path, heard):
         assert heard[name, 1].closed
 
 
-def test_one_that_is_written_anew_is_told_everything_and_another_only_what_is_new(tmp_path, heard):
+def test_one_that_is_written_anew_gets_everything_and_another_only_what_is_new(tmp_path, heard):
     run = recorder(tmp_path / "run", ["tensorboard", "wandb"])
     run.log(0, "update", 1, {"loss": 1.0})
     lengths = run.lengths()
@@ -78,7 +78,7 @@ def test_one_that_is_written_anew_is_told_everything_and_another_only_what_is_ne
     assert heard["wandb", 0].rows == [(2, {"update/loss": 2.5})]
 
 
-def test_nothing_is_told_to_anybody_where_that_is_asked_for(tmp_path, heard):
+def test_no_tracker_gets_anything_where_that_is_asked_for(tmp_path, heard):
     run = recorder(tmp_path / "run", [])
     run.log(0, "update", 1, {"loss": 1.0})
     run.close()
@@ -125,7 +125,7 @@ def test_a_tracker_that_cannot_be_opened_is_one_sentence_and_blocks_nothing(tmp_
 
 
 def went_on_elsewhere(folder):
-    """A run with a checkpoint that was told to Weights & Biases on another machine."""
+    """A run with a checkpoint that was tracked by Weights & Biases on another machine."""
     run = a_run(folder / "run", [flat(1.0)])
     config = run.config | {"options": run.config["options"] | {"track": ["wandb"]}}
     (run.folder / "config.json").write_text(json.dumps(config))
@@ -135,7 +135,7 @@ def went_on_elsewhere(folder):
     return run.folder
 
 
-def test_a_package_that_is_missing_is_told_before_anything_is_made(tmp_path, monkeypatch):
+def test_a_package_that_is_missing_is_an_error_before_anything_is_made(tmp_path, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(UserError, match=r"pip install 'beliefrl\[wandb\]'"):
         trackers.check(("wandb",))

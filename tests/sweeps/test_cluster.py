@@ -132,6 +132,6 @@ def test_a_training_whose_worker_dies_goes_on_by_itself(tmp_path, head):
     assert "1 of 1 trainings finished" in output
 
 
-def test_where_there_is_no_cluster_is_told(tmp_path):
+def test_a_missing_cluster_is_an_error(tmp_path):
     with pytest.raises(UserError, match=r"There is no Ray cluster at 127.0.0.1"):
         sweep(grid(["sac-mlp"], ["pendulum"], seeds=1), tmp_path, ray=f"127.0.0.1:{free_port()}")

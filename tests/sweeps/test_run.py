@@ -147,7 +147,7 @@ def test_nothing_is_made_where_a_name_is_wrong(tmp_path):
     assert not (tmp_path / "new").exists()
 
 
-def test_a_folder_that_cannot_be_made_is_told(tmp_path):
+def test_a_folder_that_cannot_be_made_is_an_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot be made"):
         sweep(TWO, tmp_path / "file" / "sweep")

@@ -164,7 +164,7 @@ def lowered(monkeypatch):
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("precision", ["float32", pytest.param("tensorfloat32", marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("precision", ASKED)
 def test_it_reaches_every_phase_and_a_resumed_run_keeps_it(tmp_path, lowered, precision):
     train(AGENT, "pendulum-v", tmp_path / "run", precision=precision, **OPTIONS)
     both = {(ASKED[precision],) * 2}

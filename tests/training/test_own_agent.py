@@ -139,7 +139,7 @@ def test_what_only_a_run_names_is_never_imported(altered, tmp_path, monkeypatch)
     assert "trap" not in sys.modules
 
 
-def test_a_name_with_control_characters_is_told_without_them(altered):
+def test_a_message_quotes_a_name_without_its_control_characters(altered):
     with pytest.raises(UserError) as raised:
         agent_of(altered(agent="trap\x1b[31m:Agent"))
     assert str(raised.value).isprintable()

@@ -56,12 +56,12 @@ def doubles():
 def test_a_seed_among_others_learns_as_it_does_alone_up_to_rounding(small):
     program, cycle = small
     keys = jax.random.split(jax.random.key(0), 3)
-    together, told = trained(program, keys, cycle=cycle)
-    alone, told_alone = trained(program, keys[1:2], cycle=cycle)
+    together, stretches = trained(program, keys, cycle=cycle)
+    alone, stretches_alone = trained(program, keys[1:2], cycle=cycle)
     for ours, theirs in zip(leaves(together), leaves(alone), strict=True):
         np.testing.assert_allclose(ours[1], theirs[0], rtol=1e-10, atol=1e-12)
-    for name, values in told[-1].metrics.items():
-        np.testing.assert_allclose(values[1], told_alone[-1].metrics[name][0], rtol=1e-9, atol=1e-10)
+    for name, values in stretches[-1].metrics.items():
+        np.testing.assert_allclose(values[1], stretches_alone[-1].metrics[name][0], rtol=1e-9, atol=1e-10)
     assert not np.allclose(leaves(together.state)[0][0], leaves(together.state)[0][1])
 
 
@@ -110,29 +110,29 @@ def counting(steps=120, task=None):
     task = task or Traced()
     program = phases.compile_program(agent, task, capacity=90, episodes=2)
     seeds = program.begin(jax.random.split(jax.random.key(0), 2))
-    told, counts = [], []
+    logged, counts = [], []
     for first, length in ((0, 4), (4, 6)):
         seeds, _ = program.explore(seeds, first, length)
         counts.append(len(traces))
     for first in (0, 1):
         seeds, metrics = program.pretrain(seeds, first, 1 + first)
-        told.append(metrics)
+        logged.append(metrics)
     seeds = program.refresh(seeds)
     step = 10
     for cycles in (1, 3, 5, steps // 4 - 9):
         seeds, stretch = program.learn(seeds, step, cycles)
         step += 4 * cycles
-        told.append(stretch.metrics)
+        logged.append(stretch.metrics)
         counts.append(len(traces))
-    return seeds, told, counts
+    return seeds, logged, counts
 
 
 @pytest.mark.nightly
 def test_every_window_of_a_training_is_unbroken():
     """The counter that the task shows is the agent's own count, through memory, resets, replay and its wrapping."""
     for task in (Counting(max_steps=7), Counting(ends=3), Counting(ends=1), Counting(max_steps=50)):
-        seeds, told, _ = counting(task=task)
-        for metrics in told:
+        seeds, logged, _ = counting(task=task)
+        for metrics in logged:
             np.testing.assert_array_equal(metrics["broken"], 0)
             assert (np.asarray(metrics["valid"]) > 0).all()
         assert (np.asarray(seeds.state.seen) > 0).all()

@@ -75,8 +75,8 @@ class Recall:
 
     def step(self, state, action, key):
         sign, time = state
-        told = jnp.where((time == 0) & (self.shown_in == "reward"), sign, 0.0)
-        reward = jnp.where(time == self.delay, action[0] * sign, told)
+        shown = jnp.where((time == 0) & (self.shown_in == "reward"), sign, 0.0)
+        reward = jnp.where(time == self.delay, action[0] * sign, shown)
         return (sign, time + 1), self.observation(sign, time + 1), reward, time == self.delay
 
 
@@ -90,9 +90,9 @@ def learn(task, steps, seeds=1, **hyperparameters):
     seeds, _ = program.pretrain(seeds, 0, agent.pretrain_updates)
     seeds = program.refresh(seeds)
     while step < steps:
-        seeds, told = program.learn(seeds, step, 20)
+        seeds, stretch = program.learn(seeds, step, 20)
         step += 100
-    return told.metrics, np.asarray(program.evaluate(seeds.state, keys).episode_return)[:, 1].mean()
+    return stretch.metrics, np.asarray(program.evaluate(seeds.state, keys).episode_return)[:, 1].mean()
 
 
 @pytest.mark.slow

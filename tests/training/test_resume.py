@@ -248,7 +248,7 @@ def test_a_run_that_is_being_trained_is_not_touched(whole):
 
 
 @pytest.mark.nightly
-def test_a_log_that_was_cut_is_told(whole, tmp_path):
+def test_a_log_that_was_cut_is_an_error(whole, tmp_path):
     with pytest.raises(Crash):
         train(AGENT, "pendulum-v", tmp_path / "run", crash_at(whole[1] - 2), **OPTIONS)
     (tmp_path / "run" / "metrics" / "seed-1.jsonl").write_text("")
@@ -285,23 +285,23 @@ def test_a_seed_that_diverges_stops_alone(tmp_path, monkeypatch, what, why):
         program = real(*args)
 
         def learn(seeds, first, cycles):
-            seeds, told = program.learn(seeds, first, cycles)
-            if first >= 120 and what in told.metrics:
-                told.metrics[what] = told.metrics[what].at[1].set(jnp.nan)
+            seeds, stretch = program.learn(seeds, first, cycles)
+            if first >= 120 and what in stretch.metrics:
+                stretch.metrics[what] = stretch.metrics[what].at[1].set(jnp.nan)
             elif first >= 120:
                 alpha = seeds.state.controller.log_alpha.at[1].set(jnp.nan)
                 controller = seeds.state.controller._replace(log_alpha=alpha)
                 seeds = seeds._replace(state=seeds.state._replace(controller=controller))
-            return seeds, told
+            return seeds, stretch
 
         return program._replace(learn=learn)
 
     monkeypatch.setattr(phases, "compile_program", compiled)
     notes = []
     run = train(AGENT, "pendulum-v", tmp_path / "run", lambda event: notes.append(event.note), **OPTIONS)
-    told = [note for note in notes if note]
-    assert len(told) == 1
-    assert told[0].startswith(f"seed 1 diverged by step 220: {why}; its last good checkpoint stays in ")
+    said = [note for note in notes if note]
+    assert len(said) == 1
+    assert said[0].startswith(f"seed 1 diverged by step 220: {why}; its last good checkpoint stays in ")
     assert [row["step"] for row in run.rows(0, "evaluation")] == [120, 240]
     assert [row["step"] for row in run.rows(1, "evaluation")] == [120]
     assert run.results()["mode"]["seeds"][1] is None

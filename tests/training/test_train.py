@@ -61,19 +61,19 @@ def output(*command):
 def trained(shared):
     """The folder of a finished training, and what it printed; made once where several workers want it."""
     folder = shared / "trained"
-    told = folder.with_suffix(".txt")
+    printout = folder.with_suffix(".txt")
     try:
         folder.with_suffix(".lock").touch(exist_ok=False)
     except FileExistsError:
-        wait_for(told.exists)
+        wait_for(printout.exists)
     else:
         printed = "The training failed."
         try:
             printed = output(*program(*TRAIN.split(), *flags(OPTIONS | SMALL), "--out", folder))
         finally:
-            told.with_suffix(".part").write_text(printed)
-            told.with_suffix(".part").rename(told)
-    return folder, told.read_text()
+            printout.with_suffix(".part").write_text(printed)
+            printout.with_suffix(".part").rename(printout)
+    return folder, printout.read_text()
 
 
 def wait_for(happened, seconds=400):

@@ -103,7 +103,7 @@ class Grey(Counter):
         (Counting(), "Counting cannot be rendered: give it a method draw"),
     ],
 )
-def test_what_cannot_be_seen_is_told_in_a_sentence(task, sentence):
+def test_what_cannot_be_played_is_an_error_in_one_sentence(task, sentence):
     with pytest.raises(UserError, match=sentence), player(task, "sac-mlp", rendered=True) as playing:
         playing.play(at=(0,))
 

@@ -104,7 +104,7 @@ def test_a_line_below_the_picture_leaves_it_as_it_is_and_its_sides_even():
     assert image[22:].min() < 100 < 200 < image[22:].max()  # ink on paper
 
 
-def test_an_mp4_without_its_encoder_is_told_in_a_sentence(tmp_path, run, monkeypatch):
+def test_an_mp4_without_its_encoder_is_an_error_in_one_sentence(tmp_path, run, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(UserError, match=r"pip install 'beliefrl\[video\]', or make a \.gif"):
         films.video(run, tmp_path / "film.mp4")

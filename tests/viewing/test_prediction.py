@@ -177,7 +177,7 @@ def test_a_short_episode_is_seen_to_its_half(tmp_path):
         ("slac", {"start": 13}, "start=13 is impossible: the episode has 13 timesteps, so give 12 or less"),
     ],
 )
-def test_what_cannot_be_predicted_is_told_in_a_sentence(tmp_path, name, changes, sentence):
+def test_what_cannot_be_predicted_is_an_error_in_one_sentence(tmp_path, name, changes, sentence):
     run = saved(tmp_path / "run", name, TASK)
     with pytest.raises(UserError, match=sentence):
         few(run, **changes)
