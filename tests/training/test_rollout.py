@@ -64,6 +64,12 @@ def test_first_timesteps_carry_no_reward_and_no_action():
     assert timesteps.step.prev_action[~first].all()
 
 
+def test_actions_are_sampled_in_training():
+    timesteps, _, _ = advanced(Counting(), 21)
+    actions = timesteps.step.prev_action[~timesteps.step.is_first]
+    assert len(np.unique(actions)) == len(actions)  # the agent's mode is 0.5
+
+
 def test_memory_counts_unbroken_through_every_episode():
     timesteps, _, _ = advanced(Counting(ends=5), 23)
     np.testing.assert_array_equal(timesteps.note[0], timesteps.step.obs[:, 0])
