@@ -104,3 +104,19 @@ def test_evaluation_plays_whole_episodes_and_stops_counting_at_their_end():
         np.testing.assert_array_equal(result.episode_return, total)
         np.testing.assert_array_equal(result.length, length)
         np.testing.assert_array_equal(result.measures["success"], length >= 5)
+
+
+class Alternating(Counting):
+    """Pays the action, by turns added and subtracted."""
+
+    def step(self, state, action, key):
+        state, obs, _, terminated = super().step(state, action, key)
+        return state, obs, jnp.where(state % 2 == 0, action[0], -action[0]), terminated
+
+
+def test_evaluation_draws_each_sampled_action_anew():
+    explore = jnp.array([True, True, False])
+    result = jax.jit(lambda key: rollout.evaluate(AGENT, Alternating(ends=2), STATE, key, explore))(jax.random.key(0))
+    one, other, mode = np.asarray(result.episode_return)
+    assert len({one, other, mode}) == 3
+    assert mode == 0

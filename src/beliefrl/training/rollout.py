@@ -204,6 +204,6 @@ def evaluate(agent: Agent, task: Task, state: Any, key: Key[Array, ""], explore:
         return time + 1, actors, result
 
     def unfinished(carry):
-        return (carry[0] < task.spec.max_steps) & ~jnp.all(carry[2].done)
+        return ~jnp.all(carry[2].done)
 
     return jax.lax.while_loop(unfinished, step, (jnp.array(0), actors, result))[2]
