@@ -63,7 +63,7 @@ def run(module, sample, seed):
             copy = shutil.copytree if (ROOT / part).is_dir() else shutil.copy
             copy(ROOT / part, folder / part)
         os.environ["PYTHONPATH"] = str(folder / "src")
-        os.environ["PYTHONDONTWRITEBYTECODE"] = "1"  # Python would take the bytecode of an earlier mutant of equal length
+        os.environ["PYTHONDONTWRITEBYTECODE"] = "1"  # of an earlier mutant of the same length
         os.environ["BELIEFRL_TEST_CACHE"] = str(folder / "compiled")
         config = session(module, folder, sample, seed)
         test = tomllib.loads(config.read_text())["cosmic-ray"]["test-command"]
