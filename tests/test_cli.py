@@ -26,7 +26,8 @@ AGENTS = {
     "vrm-deterministic",
 }
 TASKS = {"pendulum", "pendulum-v", "pendulum-p", "cartpole", "cartpole-v", "cartpole-p", "target-reaching"}
-ROBOTS = {name + mask for name in ("hopper", "walker2d", "ant", "halfcheetah") for mask in ("", "-v", "-p")}
+RUNNERS = ("hopper", "walker2d", "ant", "halfcheetah")
+ROBOTS = {kind + name + mask for kind in ("", "mujoco-") for name in RUNNERS for mask in ("", "-v", "-p")}
 
 
 def printed(capsys, line):

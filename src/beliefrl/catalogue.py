@@ -78,7 +78,7 @@ def our_task_names() -> dict[str, str]:
         task = written(path)
         listed |= _masked(name, task["__doc__"], task.get("VELOCITIES", ()), task.get("POSITIONS", ()))
     for name, robot in ROBOTS.items():
-        listed |= _masked(name, robot.about + " Needs the extra `robots`.", robot.velocities, robot.positions)
+        listed |= _masked(name, f"{robot.about} Needs the extra `{robot.extra}`.", robot.velocities, robot.positions)
     return listed
 
 
@@ -143,6 +143,7 @@ class Known(NamedTuple):
     positions: tuple[int, ...]  # all other entries
     extra: str | None = None  # the extra of this package that it needs
     names: tuple[str, ...] = ()  # of the entries, if the environment itself has none; a unit follows in brackets
+    arguments: tuple[tuple[str, Any], ...] = ()  # of gymnasium.make, (name, value)
 
 
 def _known(
@@ -162,6 +163,14 @@ def _mujoco(id: str, size: int, velocities: tuple[int, ...], names: tuple[str, .
     return _known(id, f"MuJoCo's {id.split('-')[0]}.", size, velocities, "mujoco", names)
 
 
+MUJOCO = {
+    "hopper": _mujoco("Hopper-v5", 11, tuple(range(5, 11))),
+    "walker2d": _mujoco("Walker2d-v5", 17, tuple(range(8, 17))),
+    "ant": _mujoco("Ant-v5", 105, tuple(range(13, 27))),
+    "halfcheetah": _mujoco("HalfCheetah-v5", 17, tuple(range(8, 17))),
+}
+
+
 ANY = "gym:ID or gym:PACKAGE:ID"
 
 ROBOTS: dict[str, Known] = {
@@ -169,6 +178,12 @@ ROBOTS: dict[str, Known] = {
     "walker2d": _bullet("Walker2D", joints=6, feet=2),
     "ant": _bullet("Ant", joints=8, feet=4),
     "halfcheetah": _bullet("HalfCheetah", joints=6, feet=6),
+    "mujoco-hopper": MUJOCO["hopper"],
+    "mujoco-walker2d": MUJOCO["walker2d"],
+    "mujoco-ant": MUJOCO["ant"]._replace(  # without the contact forces, the last 78 numbers
+        positions=tuple(range(13)), arguments=(("include_cfrc_ext_in_observation", False),)
+    ),
+    "mujoco-halfcheetah": MUJOCO["halfcheetah"],
 }
 
 GYMNASIUMS: tuple[Known, ...] = (
@@ -192,10 +207,7 @@ GYMNASIUMS: tuple[Known, ...] = (
         ),
     ),
     _mujoco("Swimmer-v5", 8, tuple(range(3, 8))),
-    _mujoco("Hopper-v5", 11, tuple(range(5, 11))),
-    _mujoco("HalfCheetah-v5", 17, tuple(range(8, 17))),
-    _mujoco("Walker2d-v5", 17, tuple(range(8, 17))),
-    _mujoco("Ant-v5", 105, tuple(range(13, 27))),
+    *MUJOCO.values(),
 )
 
 KNOWN: dict[str, Known] = {known.id: known for known in (*ROBOTS.values(), *GYMNASIUMS)}

@@ -220,19 +220,24 @@ def test_without_the_extra_there_is_the_command_to_install_it(name, extra, monke
 
 @pytest.mark.parametrize("known", catalogue.ROBOTS, ids=str)
 def test_robots_have_the_observations_of_their_masks(known):
-    pytest.importorskip("pybullet_envs_gymnasium")
     robot = catalogue.ROBOTS[known]
+    pytest.importorskip({"robots": "pybullet_envs_gymnasium", "mujoco": "mujoco"}[robot.extra])
+    assert sorted(robot.velocities + robot.positions) == list(range(len(robot.velocities + robot.positions)))
     size = len(robot.velocities) + len(robot.positions)
     assert tasks.make(known).spec.obs_dim == size
     assert tasks.make(f"{known}-v").spec.obs_dim == len(robot.velocities)
     assert tasks.make(f"{known}-p").environment().reset(seed=0)[0].shape == (len(robot.positions),)
 
 
-@pytest.mark.parametrize("known", [each for each in catalogue.GYMNASIUMS if each.extra], ids=lambda k: k.id)
-def test_velocities_of_mujoco_are_the_simulators(known):
+MUJOCO = {f"gym:{known.id}": known for known in catalogue.GYMNASIUMS if known.extra}
+MUJOCO |= {name: robot for name, robot in catalogue.ROBOTS.items() if robot.extra == "mujoco"}
+
+
+@pytest.mark.parametrize("name", MUJOCO)
+def test_velocities_of_mujoco_are_the_simulators(name):
     pytest.importorskip("mujoco")
     pytest.importorskip("imageio")
-    environment = tasks.make(f"gym:{known.id}").environment()
+    known, environment = MUJOCO[name], tasks.make(name).environment()
     environment.reset(seed=0)
     obs = environment.step(np.full(environment.action_space.shape, 0.3, np.float32))[0]
     assert len(obs) == len(known.velocities) + len(known.positions)

@@ -206,7 +206,7 @@ def _make(name: str, constants: dict[str, Any]) -> Any:
     base, mask = (name[:-2], MASKS[name[-2:]]) if name[-2:] in MASKS else (name, None)
     if base in ROBOTS:
         robot = ROBOTS[base]
-        task = registered.make(robot.id, constants, name)
+        task = registered.make(robot.id, dict(robot.arguments) | constants, name)
         return task if mask is None else dataclasses.replace(task, indices=getattr(robot, mask))
     task = _built(base, TASKS[base], constants)
     return task if mask is None else Observed(task, getattr(task, mask.upper()))
