@@ -13,6 +13,7 @@ Files are plain numbers and JSON: reading them runs no code.
 
 import hashlib
 import json
+import math
 import os
 import pathlib
 import re
@@ -39,12 +40,12 @@ class Found(NamedTuple):
     step: int
     progress: dict[str, Any]
     tree: Any
-    timesteps: Any  # numpy, leaves (seed, capacity, ...)
+    timesteps: Any  # numpy, leaves (*rings, capacity, ...)
     passed_over: list[str]  # one sentence for each newer checkpoint, which is damaged
 
 
 class Segment(NamedTuple):
-    """A file with timesteps `start` to `stop` of every seed, counted from the first that was ever added."""
+    """A file with timesteps `start` to `stop` of every ring, counted from the first that was ever added."""
 
     file: str
     start: list[int]
@@ -70,8 +71,8 @@ class Checkpoints:
             step: the environment step, part of the checkpoint's name.
             progress: everything else that is needed to continue, as values for JSON.
             tree: all arrays except the timesteps.
-            timesteps: leaves (seed, capacity, ...): a ring buffer.
-            added: (seed,), the number of timesteps that were ever added.
+            timesteps: leaves (*rings, capacity, ...): ring buffers.
+            added: the number of timesteps that were ever added to each ring; its shape is *rings.
 
         Raises:
             OSError: the previous checkpoint could not be written.
@@ -128,15 +129,16 @@ class Checkpoints:
     # Writing
 
     def _new_timesteps(self, timesteps: Any, added: np.ndarray) -> tuple[list[int], list[int], dict[str, np.ndarray]]:
-        """The timesteps that are in no file yet. Seeds with fewer new timesteps than others are padded."""
-        capacity = jax.tree.leaves(timesteps)[0].shape[1]
-        stop = [int(number) for number in added]
+        """The timesteps that are in no file yet, (ring, new). Rings with fewer new timesteps than others are padded."""
+        capacity = jax.tree.leaves(timesteps)[0].shape[added.ndim]
+        stop = [int(number) for number in added.flat]
         written = self._segments[-1].stop if self._segments else [0] * len(stop)
         start = [max(old, new - capacity) for old, new in zip(written, stop, strict=True)]
         longest = max(new - old for old, new in zip(start, stop, strict=True))
         index = (np.array(start)[:, None] + np.arange(longest)) % capacity
-        seed = np.arange(len(stop))[:, None]
-        return start, stop, arrays.copied(jax.tree.map(lambda leaf: _on_host(leaf)[seed, index], timesteps))
+        rings = (axis[:, None] for axis in np.unravel_index(np.arange(len(stop)), added.shape))
+        where = (*rings, index)
+        return start, stop, arrays.copied(jax.tree.map(lambda leaf: _on_host(leaf)[where], timesteps))
 
     def _write(self, step: int, progress: dict[str, Any], state: dict[str, np.ndarray], new: Any) -> None:
         start, stop, timesteps = new
@@ -178,13 +180,16 @@ class Checkpoints:
         """The checkpoints, the newest first."""
         return sorted(listed(self.folder.parent), reverse=True)
 
-    def restore(self, like: Any, timesteps: Any, renamed: Mapping[str, str] = MappingProxyType({})) -> Found:
+    def restore(
+        self, like: Any, timesteps: Any, renamed: Mapping[str, str] = MappingProxyType({}), axes: int = 1
+    ) -> Found:
         """Read the newest undamaged checkpoint. The next `save` writes only what is newer.
 
         Args:
             like: a tree with the structure, shapes and types of the saved one.
-            timesteps: the same for the ring buffer, whose capacity may have changed.
+            timesteps: the same for the ring buffers, whose capacity may have changed.
             renamed: names of arrays in checkpoints of older versions, by their present names.
+            axes: the number of axes of *rings, before that of the capacity.
 
         Raises:
             UserError: there is no undamaged checkpoint, or it is from another training or version.
@@ -199,7 +204,7 @@ class Checkpoints:
                 continue
             tree = arrays.read(path / "state.safetensors", like, renamed)
             self._segments = [Segment(**segment) for segment in content["replay"]]
-            rings = self._timesteps(timesteps, self._segments)
+            rings = self._timesteps(timesteps, self._segments, axes)
             return Found(content["step"], content["progress"], tree, rings, passed_over)
         why = f": {passed_over[0]}" if passed_over else "."
         raise UserError(f"{self.folder.parent} has no checkpoint to continue from{why}")
@@ -218,8 +223,10 @@ class Checkpoints:
             _check(self.folder / "replay" / segment["file"], segment["size"], segment["sha256"])
         return content
 
-    def _timesteps(self, like: Any, segments: list[Segment]) -> Any:
-        rings = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), like)
+    def _timesteps(self, like: Any, segments: list[Segment], axes: int) -> Any:
+        rings = jax.tree.map(
+            lambda leaf: np.zeros((math.prod(leaf.shape[:axes]), *leaf.shape[axes:]), leaf.dtype), like
+        )
         for segment in segments:
             path = self.folder / "replay" / segment.file
             saved = arrays.load(path)
@@ -227,9 +234,9 @@ class Checkpoints:
                 name = jax.tree_util.keystr(where)
                 if name not in saved or saved[name].shape[2:] != ring.shape[2:]:
                     raise arrays.misfit(path, name)
-                for seed, (start, stop) in enumerate(zip(segment.start, segment.stop, strict=True)):
-                    ring[seed, np.arange(start, stop) % ring.shape[1]] = saved[name][seed, : stop - start]
-        return rings
+                for number, (start, stop) in enumerate(zip(segment.start, segment.stop, strict=True)):
+                    ring[number, np.arange(start, stop) % ring.shape[1]] = saved[name][number, : stop - start]
+        return jax.tree.map(lambda ring, leaf: ring.reshape(leaf.shape), rings, like)
 
 
 def listed(folder: pathlib.Path) -> list[pathlib.Path]:

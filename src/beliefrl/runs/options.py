@@ -22,6 +22,9 @@ class Options:
     """Number of seeds. They are trained side by side in one program."""
     seed: int = 0
     """Number of the first seed. The others have the following numbers."""
+    envs: int = 1
+    """Environments of each seed, which step together. Steps are counted over all of them, and the updates per step stay
+    the same. With a slow Gymnasium environment and several cores, more environments make the training faster."""
     eval_every: int = 2_000
     """Environment steps between two evaluations (Appendix B)."""
     eval_episodes: int = 5
@@ -64,7 +67,7 @@ class Options:
         check_range(self, ("eval_episodes",), 1, MOST_EPISODES)
         check_range(self, ("checkpoint_steps", "checkpoint_minutes"), 0)
         check_range(self, ("keep_checkpoints",), 1, 1_000_000)
-        check_range(self, ("seeds",), 1, 10_000)
+        check_range(self, ("seeds", "envs"), 1, 10_000)
         check_range(self, ("seed",), 0, 2_000_000_000)
         check_choice(self, "processes", get_args(Processes))
         check_choice(self, "precision", get_args(Precision))

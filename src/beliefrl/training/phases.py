@@ -11,8 +11,14 @@ how the training is cut into them. Random keys are derived from the seed's key a
 
 The loops over steps, updates and cycles are outside what is mapped over seeds: JAX traces the body of a loop that is
 mapped three times, and that of a loop over a mapped body once.
+
+A seed may have several environments, `envs`, each with an actor and a ring of the replay of its own: the actors' and
+the replay's leaves then have an axis `env`. All environments step together, and steps are counted over all of them.
+Learning goes on in rounds: the fewest steps that are whole cycles and whole steps of all environments, then the
+updates of these cycles. With one environment a round is a cycle, and there is no axis `env`.
 """
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -32,9 +38,20 @@ from beliefrl.types import Spec, UserError
 Metrics = dict[str, Float[Array, "..."]]
 
 
-def stretch_length(agent: Agent) -> int:
-    """Environment steps between two entries of the log, at most: whole cycles, about 100 steps."""
-    return max(100 // agent.cycle, 1) * agent.cycle
+def round_length(agent: Agent, envs: int = 1) -> int:
+    """Environment steps of a round of learning, summed over the environments of a seed."""
+    return math.lcm(agent.cycle, envs)
+
+
+def stretch_length(agent: Agent, envs: int = 1) -> int:
+    """Environment steps between two entries of the log, at most: whole rounds, about 100 steps."""
+    length = round_length(agent, envs)
+    return max(100 // length, 1) * length
+
+
+def on_each_env(envs: int, function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function of one environment's arrays as one of those of all environments of a seed."""
+    return function if envs == 1 else jax.vmap(function)
 
 
 class SeedState(NamedTuple):
@@ -53,51 +70,75 @@ class Stretch(NamedTuple):
     episodes: Episode | None  # leaves (seed, stretch): one entry a step, done only where an episode ended
 
 
-def begin(agent: Agent, task: Task, capacity: int, key: Key[Array, ""]) -> SeedState:
-    """A seed before its first step; its replay holds `capacity` timesteps."""
+def begin(agent: Agent, task: Task, capacity: int, key: Key[Array, ""], envs: int = 1) -> SeedState:
+    """A seed before its first step; its replay holds `capacity` timesteps of each environment."""
     key_state, key_actor, key = jax.random.split(key, 3)
-    return seed_of(agent, task.spec, capacity, rollout.begin(agent, task, key_actor), key_state, key)
+    keys = key_actor if envs == 1 else jax.random.split(key_actor, envs)
+    actor = on_each_env(envs, partial(rollout.begin, agent, task))(keys)
+    return seed_of(agent, task.spec, capacity, actor, key_state, key, envs)
 
 
 def seed_of(
-    agent: Agent, spec: Spec, capacity: int, actor: ActorState, key_state: Key[Array, ""], key: Key[Array, ""]
+    agent: Agent,
+    spec: Spec,
+    capacity: int,
+    actor: ActorState,
+    key_state: Key[Array, ""],
+    key: Key[Array, ""],
+    envs: int = 1,
 ) -> SeedState:
-    """A new agent and an empty replay for an actor at its first timestep."""
+    """A new agent and an empty replay for actors at their first timestep."""
     state = rollout.strong(agent.init(key_state, spec))
-    return SeedState(state, actor, ring.init(rollout.stored(agent, actor), capacity), key)
+    replay = on_each_env(envs, lambda actor: ring.init(rollout.stored(agent, actor), capacity))(actor)
+    return SeedState(state, actor, replay, key)
 
 
 def _write(log: Episode, index: Int[Array, ""], episode: Episode) -> Episode:
-    return jax.tree.map(lambda column, entry: column.at[index].set(entry), log, episode)
+    """The log with an entry at `index`, or with one for each environment from there on."""
+
+    def write(column: Array, entry: Array) -> Array:
+        if entry.ndim:
+            return jax.lax.dynamic_update_slice_in_dim(column, entry, index, axis=0)
+        return column.at[index].set(entry)
+
+    return jax.tree.map(write, log, episode)
 
 
 def step_key(key: Key[Array, ""], step: Int[Array, ""], purpose: int) -> Key[Array, ""]:
     return jax.random.fold_in(jax.random.fold_in(key, purpose), step)
 
 
+def acting_keys(key: Key[Array, ""], step: Int[Array, ""], envs: int) -> Key[Array, "*env"]:
+    """The key of each environment for its step; the environments' steps have the numbers from `step` on."""
+    if envs == 1:
+        return step_key(key, step, ACT)
+    return jax.vmap(lambda env: step_key(key, step + env, ACT))(jnp.arange(envs))
+
+
 ACT, UPDATE, SAMPLE, CYCLE, PRETRAIN, REFRESH, EVALUATE, REVIVE = range(8)  # purposes of keys: no two share one
 
 
 def explore(
-    agent: Agent, task: Task, seeds: SeedState, first: Int[Array, ""], steps: Int[Array, ""]
+    agent: Agent, task: Task, seeds: SeedState, first: Int[Array, ""], steps: Int[Array, ""], envs: int = 1
 ) -> tuple[SeedState, Stretch]:
     """Environment steps `first` to `first + steps` without updates; at most `stretch_length` of them."""
 
     def step(i, carry):
         seeds, log = carry
-        return jax.vmap(partial(_act, agent, task), in_axes=(0, 0, None, None))(seeds, log, first + i, i)
+        act = jax.vmap(partial(_act, agent, task, envs), in_axes=(0, 0, None, None))
+        return act(seeds, log, first + i * envs, i * envs)
 
-    none = rollout.no_episodes(task.spec, (len(seeds.key), stretch_length(agent)))
-    seeds, log = jax.lax.fori_loop(0, steps, step, (seeds, none))
+    none = rollout.no_episodes(task.spec, (len(seeds.key), stretch_length(agent, envs)))
+    seeds, log = jax.lax.fori_loop(0, steps // envs, step, (seeds, none))
     return seeds, Stretch({}, log)
 
 
 def _act(
-    agent: Agent, task: Task, seed: SeedState, log: Episode, step: Int[Array, ""], index: Int[Array, ""]
+    agent: Agent, task: Task, envs: int, seed: SeedState, log: Episode, step: Int[Array, ""], index: Int[Array, ""]
 ) -> tuple[SeedState, Episode]:
-    """One environment step, whose entry in the log is at `index`."""
-    key = step_key(seed.key, step, ACT)
-    actor, replay, episode = rollout.advance(agent, task, seed.state, seed.actor, seed.replay, key)
+    """One step of every environment of a seed. Their entries in the log begin at `index`."""
+    advance = on_each_env(envs, partial(rollout.advance, agent, task, seed.state))
+    actor, replay, episode = advance(seed.actor, seed.replay, acting_keys(seed.key, step, envs))
     return seed._replace(actor=actor, replay=replay), _write(log, index, episode)
 
 
@@ -128,48 +169,65 @@ def pretrain(
     return seeds, jax.tree.map(lambda total: total / jnp.maximum(updates, 1), totals)
 
 
-def refresh(agent: Agent, spec: Spec, seed: SeedState) -> SeedState:
-    """Recompute the notes and the actor's memory with the pre-trained networks (at most 2 timesteps a step)."""
-    length = min(2 * agent.step_start_rl, ring.capacity(seed.replay))
+def refresh(agent: Agent, spec: Spec, seed: SeedState, envs: int = 1) -> SeedState:
+    """Recompute the notes and the actors' memories with the pre-trained networks (at most 2 timesteps a step)."""
+    length = min(2 * -(-agent.step_start_rl // envs), ring.capacity(seed.replay))
     key = jax.random.fold_in(seed.key, REFRESH)
-    actor, replay = rollout.refresh(agent, spec, seed.state, seed.actor, seed.replay, key, length)
+    keys = key if envs == 1 else jax.random.split(key, envs)
+    again = partial(rollout.refresh, agent, spec, seed.state, length=length)
+    actor, replay = on_each_env(envs, again)(seed.actor, seed.replay, keys)
     return seed._replace(actor=actor, replay=replay)
 
 
 def learn(
-    agent: Agent, task: Task, seeds: SeedState, first: Int[Array, ""], cycles: Int[Array, ""]
+    agent: Agent, task: Task, seeds: SeedState, first: Int[Array, ""], rounds: Int[Array, ""], envs: int = 1
 ) -> tuple[SeedState, Stretch]:
-    """`cycles` cycles of learning from environment step `first` on; at most `stretch_length` steps in all."""
+    """`rounds` rounds of learning from environment step `first` on; at most `stretch_length` steps in all."""
     # Traced once, for its shapes and for the loop.
-    one_cycle = jax.jit(jax.vmap(partial(_cycle, agent, task), in_axes=(0, 0, None, None)), inline=True)
-    none = rollout.no_episodes(task.spec, (len(seeds.key), stretch_length(agent)))
-    shapes = jax.eval_shape(one_cycle, seeds, none, first, first)[2]
+    one_round = jax.jit(jax.vmap(partial(_round, agent, task, envs), in_axes=(0, 0, None, None)), inline=True)
+    none = rollout.no_episodes(task.spec, (len(seeds.key), stretch_length(agent, envs)))
+    shapes, length = jax.eval_shape(one_round, seeds, none, first, first)[2], round_length(agent, envs)
 
     def step(i, carry):
         seeds, log, totals = carry
-        seeds, log, metrics = one_cycle(seeds, log, first + i * agent.cycle, i * agent.cycle)
+        seeds, log, metrics = one_round(seeds, log, first + i * length, i * length)
         return seeds, log, jax.tree.map(jnp.add, totals, metrics)
 
-    seeds, log, totals = jax.lax.fori_loop(0, cycles, step, (seeds, none, _sum_metrics(shapes)))
-    return seeds, Stretch(jax.tree.map(lambda total: total / jnp.maximum(cycles, 1), totals), log)
+    seeds, log, totals = jax.lax.fori_loop(0, rounds, step, (seeds, none, _sum_metrics(shapes)))
+    return seeds, Stretch(jax.tree.map(lambda total: total / jnp.maximum(rounds, 1), totals), log)
 
 
-def _cycle(
-    agent: Agent, task: Task, seed: SeedState, log: Episode, first: Int[Array, ""], index: Int[Array, ""]
+def _round(
+    agent: Agent, task: Task, envs: int, seed: SeedState, log: Episode, first: Int[Array, ""], index: Int[Array, ""]
 ) -> tuple[SeedState, Episode, Metrics]:
-    """One cycle, from environment step `first` on, whose entries in the log begin at `index`.
+    """One round, from environment step `first` on, whose entries in the log begin at `index`.
 
     Its timesteps are added before any are drawn, and in a loop whose length XLA does not know (it would inline one of a
     single step): in either other form XLA copies the whole ring.
     """
+    length = round_length(agent, envs)
 
-    def act(step, carry):
+    def act(number, carry):
         seed, log = carry
-        return _act(agent, task, seed, log, step, index + step - first)
+        step = number * envs
+        return _act(agent, task, envs, seed, log, step, index + step - first)
 
-    seed, log = jax.lax.fori_loop(first, first + agent.cycle, act, (seed, log))
-    state, metrics = learn_cycle(agent, seed, first)
+    seed, log = jax.lax.fori_loop(first // envs, (first + length) // envs, act, (seed, log))
+    state, metrics = learn_round(agent, seed, first, envs)
     return seed._replace(state=state), log, metrics
+
+
+def learn_round(agent: Agent, seed: SeedState, first: Int[Array, ""], envs: int = 1) -> tuple[Any, Metrics]:
+    """The updates after the steps of the round that began at environment step `first`: new state and mean metrics."""
+    cycles = round_length(agent, envs) // agent.cycle
+    if cycles == 1:
+        return learn_cycle(agent, seed, first)
+
+    def cycle(state, number):
+        return learn_cycle(agent, seed._replace(state=state), first + number * agent.cycle)
+
+    state, metrics = jax.lax.scan(cycle, seed.state, jnp.arange(cycles))
+    return state, jax.tree.map(lambda each: jnp.mean(each, axis=0), metrics)
 
 
 def learn_cycle(agent: Agent, seed: SeedState, first: Int[Array, ""]) -> tuple[Any, Metrics]:
@@ -209,7 +267,7 @@ class Program(NamedTuple):
     explore: Callable[..., tuple[SeedState, Stretch]]  # seeds, first, steps
     pretrain: Callable[..., tuple[SeedState, Metrics]]  # seeds, first, updates
     refresh: Callable[..., SeedState]  # seeds
-    learn: Callable[..., tuple[SeedState, Stretch]]  # seeds, first, cycles
+    learn: Callable[..., tuple[SeedState, Stretch]]  # seeds, first, rounds
     evaluate: Callable[..., Episode]  # states (seed, ...), keys (seed,); leaves (seed, 2, episodes)
     shapes: Callable[..., SeedState]  # keys (seed,); what `begin` gives, without its numbers
     revive: Callable[..., SeedState] = lambda seeds, step: seeds  # after they were read from a checkpoint
@@ -219,15 +277,15 @@ class Program(NamedTuple):
 RUN_ONCE = {"xla_backend_optimization_level": 0}  # compiles in half the time; the numbers drawn are the same
 
 
-def compile_program(agent: Agent, task: Task, capacity: int, episodes: int) -> Program:
+def compile_program(agent: Agent, task: Task, capacity: int, episodes: int, envs: int = 1) -> Program:
     """The phases as compiled functions. They donate the memory of the seeds that they are given."""
-    start = jax.jit(jax.vmap(partial(begin, agent, task, capacity)), compiler_options=RUN_ONCE)
+    start = jax.jit(jax.vmap(partial(begin, agent, task, capacity, envs=envs)), compiler_options=RUN_ONCE)
     return Program(
         begin=start,
-        explore=jax.jit(partial(explore, agent, task), donate_argnums=0),
+        explore=jax.jit(partial(explore, agent, task, envs=envs), donate_argnums=0),
         pretrain=jax.jit(partial(pretrain, agent), donate_argnums=0),
-        refresh=jax.jit(jax.vmap(partial(refresh, agent, task.spec)), donate_argnums=0),
-        learn=jax.jit(partial(learn, agent, task), donate_argnums=0),
+        refresh=jax.jit(jax.vmap(partial(refresh, agent, task.spec, envs=envs)), donate_argnums=0),
+        learn=jax.jit(partial(learn, agent, task, envs=envs), donate_argnums=0),
         evaluate=jax.jit(jax.vmap(partial(evaluate, agent, task, episodes=episodes))),
         shapes=partial(jax.eval_shape, start),
     )

@@ -15,8 +15,10 @@ from beliefrl.types import StoredTimestep, Timestep, Window, WindowShape
 
 
 class Replay(NamedTuple):
+    """A ring of timesteps. With several environments it is mapped: every leaf has a leading axis, one ring for each."""
+
     timesteps: StoredTimestep  # leaves (capacity, ...)
-    added: Int[Array, ""]  # timesteps ever added; the ring holds the last `capacity` of them
+    added: Int[Array, "*rings"]  # timesteps ever added; the ring holds the last `capacity` of them
 
 
 def init(timestep: StoredTimestep, capacity: int) -> Replay:
@@ -27,8 +29,8 @@ def init(timestep: StoredTimestep, capacity: int) -> Replay:
 
 
 def capacity(replay: Replay) -> int:
-    """How many timesteps the ring holds when full."""
-    return replay.timesteps.step.reward.shape[0]
+    """How many timesteps a ring holds when full."""
+    return replay.timesteps.step.reward.shape[-1]
 
 
 def add(replay: Replay, timestep: StoredTimestep, keep: Bool[Array, ""] | bool = True) -> Replay:
@@ -44,21 +46,32 @@ def sample(replay: Replay, key: Key[Array, ""], batch: int, shape: WindowShape) 
 
     The first transition after the burn-in is uniform over all starts whose `length` transitions are stored, so
     every stored transition can be drawn. The burn-in overhangs where too little lies before it; with fewer timesteps
-    than a window needs the rest overhangs as well. What overhangs is marked in `exists`.
+    than a window needs the rest overhangs as well. What overhangs is marked in `exists`. With several rings, the start
+    is uniform over those of all rings.
     """
     oldest = jnp.maximum(replay.added - capacity(replay), 0)
     stored = replay.added - oldest
-    start = jax.random.randint(key, (batch, 1), 0, jnp.maximum(stored - shape.length, 1)).T
+    starts = jnp.maximum(stored - shape.length, 1)
+    if replay.added.ndim:
+        after = jnp.cumsum(starts)
+        start = jax.random.randint(key, (1, batch), 0, after[-1])
+        ring = jnp.searchsorted(after, start, side="right")
+        start, oldest, stored = start - (after - starts)[ring], oldest[ring], stored[ring]
+    else:
+        start, ring = jax.random.randint(key, (batch, 1), 0, starts).T, None
     position = start + jnp.arange(-shape.burn_in, shape.length + 1)[:, None]  # 0 is the oldest timestep
-    timesteps = gather(replay, oldest + position)
+    timesteps = gather(replay, oldest + position, ring)
     step = timesteps.step._replace(is_first=timesteps.step.is_first | (position <= 0))
     return Window(step, timesteps.note, (position >= 0) & (position < stored))
 
 
-def gather(replay: Replay, number: Int[Array, "*shape"]) -> StoredTimestep:
-    """The timesteps of these running numbers (0 is the first ever added), leaves (*shape, ...)."""
+def gather(replay: Replay, number: Int[Array, "*shape"], ring: Int[Array, "1 batch"] | None = None) -> StoredTimestep:
+    """The timesteps of these running numbers (0 is the first ever added), leaves (*shape, ...).
+
+    With several rings, `ring` has the index of the ring for each number; it broadcasts against `number`.
+    """
     index = number % capacity(replay)
-    return jax.tree.map(lambda leaf: leaf[index], replay.timesteps)
+    return jax.tree.map(lambda leaf: leaf[index] if ring is None else leaf[ring, index], replay.timesteps)
 
 
 def history(replay: Replay, length: int) -> tuple[Timestep, Bool[Array, " length"]]:

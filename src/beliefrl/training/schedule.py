@@ -111,9 +111,9 @@ def stages(
         if own_process:
             host_loop.keep_memory()
         processes = _processes(options, own_process)
-        program = host_loop.program(agent, task, *sizes, numbers, processes, notify, options.step_timeout)
+        program = host_loop.program(agent, task, *sizes, numbers, processes, notify, options.step_timeout, options.envs)
     else:
-        program = phases.compile_program(agent, task, *sizes)
+        program = phases.compile_program(agent, task, *sizes, options.envs)
     keys, at = jax.vmap(jax.random.key)(np.array(numbers)), TrainingProgress(refreshed=initial is not None)
     try:
         if restore is None:
@@ -142,8 +142,9 @@ def stages(
 def _stages(
     agent: Agent, program: Program, options: Options, at: TrainingProgress, seeds: SeedState
 ) -> Iterator[Event]:
+    envs, length = options.envs, phases.round_length(agent, options.envs)
     explored = min(agent.step_start_rl, options.steps)
-    stretch = phases.stretch_length(agent)
+    stretch = phases.stretch_length(agent, envs)
 
     if at.evaluated // options.eval_every < at.step // options.eval_every:  # an environment failed in this evaluation
         yield from _evaluation(program, seeds, at.step, Phase.LEARNING)
@@ -154,11 +155,12 @@ def _stages(
         seeds, _ = program.explore(seeds, at.step, 0)
         yield Event(Phase.EXPLORING, at.step)
     while at.step < explored:
-        steps = min(stretch, explored - at.step, _until(at.step, options.eval_every))
+        until = min(stretch, explored - at.step, _until(at.step, options.eval_every))
+        steps = -(-until // envs) * envs
         seeds, log = program.explore(seeds, at.step, steps)
-        at = at._replace(step=at.step + steps)
+        before, at = at.step, at._replace(step=at.step + steps)
         yield Event(Phase.EXPLORING, at.step, episodes=log.episodes)
-        if at.step % options.eval_every == 0:
+        if at.step // options.eval_every > before // options.eval_every:
             yield from _evaluation(program, seeds, at.step, Phase.EXPLORING)
             at = at._replace(evaluated=at.step)
         yield Event(Phase.EXPLORING, at.step, snapshot=Snapshot(at, seeds))
@@ -184,9 +186,9 @@ def _stages(
         yield Event(Phase.LEARNING, at.step)
     while at.step < options.steps:
         until = min(options.steps - at.step, _until(at.step, options.eval_every))
-        cycles = min(-(-until // agent.cycle), stretch // agent.cycle)
-        seeds, log = program.learn(seeds, at.step, cycles)
-        before, at = at.step, at._replace(step=at.step + cycles * agent.cycle)
+        rounds = min(-(-until // length), stretch // length)
+        seeds, log = program.learn(seeds, at.step, rounds)
+        before, at = at.step, at._replace(step=at.step + rounds * length)
         yield Event(Phase.LEARNING, at.step, log.metrics, log.episodes)
         if at.step // options.eval_every > before // options.eval_every:
             yield from _evaluation(program, seeds, at.step, Phase.LEARNING)
@@ -201,17 +203,21 @@ ROOM = 1.25  # timesteps in the replay for each step: with episodes of 4 steps a
 
 
 def capacity(agent: Agent, options: Options) -> int:
-    """Timesteps in a seed's replay: one for each step, and room for those that end episodes.
+    """Timesteps in the replay of each environment: one for each of its steps, and room for those that end episodes.
 
     Where episodes are shorter than 4 steps on average, the oldest timesteps are replaced before the training ends.
 
     Raises:
         UserError: `replay_capacity` has no room for the exploration, or for a window.
     """
-    needed = max(2 * agent.step_start_rl, agent.window.length + 1)  # `refresh` wants all of the exploration
-    if options.steps > agent.step_start_rl and options.replay_capacity < needed:
-        raise UserError(f"replay_capacity={options.replay_capacity} is too small: this agent needs at least {needed}.")
-    return min(options.replay_capacity, max(int(ROOM * options.steps), min(needed, 2 * options.steps)))
+    explored, steps = (-(-each // options.envs) for each in (agent.step_start_rl, options.steps))
+    needed = max(2 * explored, agent.window.length + 1)  # `refresh` wants all of the exploration
+    if options.steps > agent.step_start_rl and options.replay_capacity < needed * options.envs:
+        raise UserError(
+            f"replay_capacity={options.replay_capacity} is too small: this agent needs at least "
+            f"{needed * options.envs}."
+        )
+    return min(options.replay_capacity // options.envs, max(int(ROOM * steps), min(needed, 2 * steps)))
 
 
 def _processes(options: Options, own_process: bool) -> Processes:

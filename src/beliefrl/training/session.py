@@ -109,7 +109,7 @@ class Session:
         """Restore the last undamaged checkpoint, and truncate the log to its length at that time."""
         ring = shapes.replay
         like = shapes._replace(replay=ring._replace(timesteps=()))
-        found = self.checkpoints.restore(like, ring.timesteps, RENAMED)
+        found = self.checkpoints.restore(like, ring.timesteps, RENAMED, axes=ring.added.ndim)
         for why in found.passed_over:
             self._report(Event(Phase.RESUMING, found.step, note=f"{why} The checkpoint before it is used."))
         self.recorder.rewind({int(seed): length for seed, length in found.progress["metrics"].items()})
