@@ -70,9 +70,9 @@ class Joint(eqx.Module):
         self,
         features: Float[Array, "time batch hidden"],
         prev_action: Float[Array, "time batch action"],
-        posterior_reads_x: bool = True,
+        posterior_reads_x: bool,
     ) -> Float[Array, "time batch joint"]:
-        """What the layer gets from f_x(x_t) and a_{t-1}; without f_x(x_t) for the posterior unless it sees it."""
+        """What the layer gets from f_x(x_t) and a_{t-1}; without f_x(x_t) for the posterior unless it reads x_t."""
         posterior = prev_action @ self.w_action
         gates = jnp.zeros((*posterior.shape[:-1], self.w_z.shape[1]))
         w_features = self.w_features
