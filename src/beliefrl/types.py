@@ -1,4 +1,5 @@
-"""The types that the whole library shares: a timestep, a window of timesteps, a task's sizes, a user's mistake.
+"""The types that the whole library shares: a timestep, a window of timesteps, a task's sizes, and the
+error for a user's mistake (`UserError`).
 
 Axis names in shapes, everywhere: `seed` (one training each), `batch` (windows), `time` (timesteps of a window),
 `obs`, `action`, `belief` (input of the controller), `d` (recurrent state), `z` (latent variable), `x` (perception).

@@ -1,8 +1,8 @@
 """The replay: a ring of timesteps, and windows drawn from it.
 
-One record per timestep, an episode's last observation included, so a truncated episode keeps what its value is
-bootstrapped from, and no observation is stored twice. Additions come before draws within a compiled step, and a
-masked addition writes out of bounds instead of branching: either mistake makes XLA copy the whole ring.
+The ring has one record per timestep, including the last observation of an episode. So the value at a time limit can be
+bootstrapped, and no observation is stored twice. Within a compiled step, additions come before draws, and a masked
+addition writes out of bounds and does not branch. Otherwise XLA copies the whole ring.
 """
 
 from typing import Any, NamedTuple
@@ -27,12 +27,12 @@ def init(timestep: StoredTimestep, capacity: int) -> Replay:
 
 
 def capacity(replay: Replay) -> int:
-    """How many timesteps the ring holds when full."""
+    """The number of timesteps in a full ring."""
     return replay.timesteps.step.reward.shape[0]
 
 
 def add(replay: Replay, timestep: StoredTimestep, keep: Bool[Array, ""] | bool = True) -> Replay:
-    """Append a timestep where `keep`; the oldest makes room."""
+    """Append a timestep if `keep`; it replaces the oldest one in a full ring."""
     size = capacity(replay)
     index = jnp.where(keep, replay.added % size, size)
     timesteps = jax.tree.map(lambda ring, leaf: ring.at[index].set(leaf, mode="drop"), replay.timesteps, timestep)
@@ -42,9 +42,9 @@ def add(replay: Replay, timestep: StoredTimestep, keep: Bool[Array, ""] | bool =
 def sample(replay: Replay, key: Key[Array, ""], batch: int, shape: WindowShape) -> Window:
     """Draw `batch` windows of burn_in + length + 1 timesteps, leaves (time, batch, ...).
 
-    The first transition after the burn-in is uniform over all starts whose `length` transitions are stored, so
-    every stored transition can be drawn. The burn-in overhangs where too little lies before it; with fewer timesteps
-    than a window needs the rest overhangs as well. What overhangs is marked in `exists`.
+    The first transition after the burn-in is uniform over all starts whose `length` transitions are stored. So every
+    stored transition can be drawn. The burn-in may extend beyond the oldest timestep. With fewer timesteps than a
+    window needs, the rest does too. `exists` is False for these timesteps.
     """
     oldest = jnp.maximum(replay.added - capacity(replay), 0)
     stored = replay.added - oldest
@@ -62,7 +62,7 @@ def gather(replay: Replay, number: Int[Array, "*shape"]) -> StoredTimestep:
 
 
 def history(replay: Replay, length: int) -> tuple[Timestep, Bool[Array, " length"]]:
-    """The first `length` timesteps ever added, and which of them exist; meant for before the ring is full."""
+    """The first `length` timesteps ever added, and which of them exist, for use before the ring is full."""
     number = jnp.arange(length)
     return gather(replay, number).step, number < replay.added
 
