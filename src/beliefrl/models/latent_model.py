@@ -93,7 +93,7 @@ class LatentModel(eqx.Module):
         is_first: Bool[Array, "time batch"],
         noise: tuple[Float[Array, "time batch z1"], Float[Array, "time batch z2"]],
     ) -> Latents:
-        """The latent variables of windows. They start anew where is_first is set; prev_action must be 0 there."""
+        """The latent variables of windows. They are reset where is_first is set; prev_action must be 0 there."""
         known = jnp.concatenate([is_first[..., None].astype(x.dtype), prev_action], axis=-1)
         z1, z2 = (part.shape[-1] for part in noise)
         w_x, w_z2 = self.posterior.columns(x.shape[-1] + known.shape[-1], z2)

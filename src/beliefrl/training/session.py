@@ -58,7 +58,7 @@ class Session:
         self.is_stopped = False  # by the callback
         self.ended: str | None = None  # why the training is finished before its last step, a sentence
         self.was_finished = False  # before it was resumed
-        self.requests = Requests(partial(self._note, "stopping after this stretch; Ctrl-C again ends at once"))
+        self.requests = Requests(partial(self._note, "stopping after this block of steps; Ctrl-C again ends at once"))
 
     def run(
         self,
