@@ -71,8 +71,8 @@ class Event(NamedTuple):
 
     phase: Phase  # the next one
     step: int  # environment steps of each seed so far
-    metrics: Metrics = {}  # leaves (seed,): means over the last stretch
-    episodes: Episode | None = None  # leaves (seed, stretch)
+    metrics: Metrics = {}  # leaves (seed,): means over the last block of steps
+    episodes: Episode | None = None  # leaves (seed, step): of the last block
     evaluation: Episode | None = None  # leaves (seed, mode, episodes)
     states: Any = None  # the agents, if they should be saved
     part: tuple[int, int] | None = None  # of the pre-training: updates done, and their total
