@@ -72,7 +72,7 @@ class Joint(eqx.Module):
         prev_action: Float[Array, "time batch action"],
         posterior_reads_x: bool = True,
     ) -> Float[Array, "time batch joint"]:
-        """The layer's products with f_x(x_t) and a_{t-1}; for the posterior without f_x(x_t), unless it reads it."""
+        """What the layer gets from f_x(x_t) and a_{t-1}; without f_x(x_t) for the posterior unless it sees it."""
         posterior = prev_action @ self.w_action
         gates = jnp.zeros((*posterior.shape[:-1], self.w_z.shape[1]))
         w_features = self.w_features
