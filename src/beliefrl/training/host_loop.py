@@ -154,7 +154,7 @@ class HostLoop:
         return seeds, log.stretch()
 
     def _compile(self, seeds: SeedState, output: ActorOutput, learns: bool) -> None:
-        """Compile the function that follows a step of the environments, which otherwise looks like a slow step."""
+        """Compile what follows a step of the environments: else a compilation would look like a slow environment."""
         lanes = len(output.action)
         obs, number, never = (
             np.zeros((lanes, self.spec.obs_dim), np.float32),

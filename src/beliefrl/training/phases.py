@@ -8,8 +8,8 @@ The step counter is not mapped over seeds. Each phase is a compiled function of 
 steps. The number of steps is an argument, so each phase is compiled once, and no result depends on the length of the
 blocks. Random keys are derived from the seed's key and the number of the step. `schedule` calls the phases.
 
-The loops over steps, updates and cycles are outside the mapping over seeds. JAX traces the body of a mapped loop three
-times, and the body of a loop over a mapped function once.
+The loops over steps, updates and cycles are outside what is mapped over seeds: JAX traces the body of a loop that is
+mapped three times, and that of a loop over a mapped body once.
 """
 
 from collections.abc import Callable

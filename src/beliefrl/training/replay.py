@@ -27,7 +27,7 @@ def init(timestep: StoredTimestep, capacity: int) -> Replay:
 
 
 def capacity(replay: Replay) -> int:
-    """The number of timesteps in a full ring."""
+    """How many timesteps the ring holds when full."""
     return replay.timesteps.step.reward.shape[0]
 
 
@@ -42,9 +42,9 @@ def add(replay: Replay, timestep: StoredTimestep, keep: Bool[Array, ""] | bool =
 def sample(replay: Replay, key: Key[Array, ""], batch: int, shape: WindowShape) -> Window:
     """Draw `batch` windows of burn_in + length + 1 timesteps, leaves (time, batch, ...).
 
-    The first transition after the burn-in is uniform over all starts whose `length` transitions are stored. So every
-    stored transition can be drawn. The burn-in may extend beyond the oldest timestep. With fewer timesteps than a
-    window needs, the rest does too. `exists` is False for these timesteps.
+    The first transition after the burn-in is uniform over all starts whose `length` transitions are stored, so
+    every stored transition can be drawn. The burn-in overhangs where too little lies before it; with fewer timesteps
+    than a window needs the rest overhangs as well. What overhangs is marked in `exists`.
     """
     oldest = jnp.maximum(replay.added - capacity(replay), 0)
     stored = replay.added - oldest

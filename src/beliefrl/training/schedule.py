@@ -201,14 +201,14 @@ ROOM = 1.25  # timesteps in the replay per step: with episodes of at least 4 ste
 
 
 def capacity(agent: Agent, options: Options) -> int:
-    """Timesteps in a seed's replay: one for each step, and room for the last timesteps of episodes.
+    """Timesteps in a seed's replay: one for each step, and room for those that end episodes.
 
     If episodes are shorter than 4 steps on average, the oldest timesteps are replaced before the training ends.
 
     Raises:
         UserError: `replay_capacity` has no room for the exploration, or for a window.
     """
-    needed = max(2 * agent.step_start_rl, agent.window.length + 1)  # `refresh` needs all of the exploration
+    needed = max(2 * agent.step_start_rl, agent.window.length + 1)  # `refresh` wants all of the exploration
     if options.steps > agent.step_start_rl and options.replay_capacity < needed:
         raise UserError(f"replay_capacity={options.replay_capacity} is too small: this agent needs at least {needed}.")
     return min(options.replay_capacity, max(int(ROOM * options.steps), min(needed, 2 * options.steps)))
