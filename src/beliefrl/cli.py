@@ -9,21 +9,21 @@ from beliefrl.errors import UsageError, UserError, one_line
 
 HELP = """usage: beliefrl COMMAND ...
 
-Reinforcement learning for agents that do not see the whole state.
+Reinforcement learning under partial observability: the agent observes only a part of the state.
 
   beliefrl demo [TASK]          watch a small trained agent that comes with the package
-  beliefrl check TASK           what a task observes and wants, and what the training would refuse
+  beliefrl check TASK           a task's observations, actions and rewards, and why a training would refuse it
   beliefrl train AGENT TASK     train, with a live view, into a run's folder
   beliefrl resume RUN           continue a training that was stopped or killed, or train it longer
   beliefrl sweep --preset NAME  many trainings: agents x tasks x settings x seeds, on all cores or a Ray cluster
   beliefrl tune AGENT TASK      search for good hyperparameters with Optuna, in many trainings
   beliefrl figure KIND RUNS     the paper's figures and tables from finished runs: curves, ablation, elbo, ...
   beliefrl show RUN             the settings, progress and results of a run
-  beliefrl evaluate RUN         play new episodes with what a run has learned
-  beliefrl export RUN FILE      write the learned policy as one file, for jax or (.onnx) for onnxruntime
+  beliefrl evaluate RUN         play new episodes with the trained agent of a run
+  beliefrl export RUN FILE      write the trained policy to one file, for jax or (.onnx) for onnxruntime
   beliefrl report RUNS          one page for the browser: curves, final returns, settings, time
-  beliefrl predict RUN          draw what its model predicts of an episode, open loop and closed loop, beside the truth
-  beliefrl video RUN FILE       film episodes, as mp4 or gif
+  beliefrl predict RUN          draw its model's predictions of an episode, open loop and closed loop, and the truth
+  beliefrl video RUN FILE       record episodes, as mp4 or gif
   beliefrl film RUN ...         draw a film strip of an episode, a row for each run
   beliefrl tasks                list the tasks
   beliefrl agents               list the agents
@@ -39,11 +39,12 @@ for example
   beliefrl train my_module:MyAgent pendulum-p
 
 COMMAND --help shows the options of a command; `beliefrl train AGENT --help` also the agent's hyperparameters,
-with their defaults and where in the paper they stand. AGENT is a name that `beliefrl agents` lists, or MODULE:CLASS,
-an agent of your own in this folder or on the Python path. Commands that read its runs need --agent MODULE:CLASS.
+with their defaults and their place in the paper. AGENT is a name that `beliefrl agents` lists, or MODULE:CLASS, an
+agent of your own in this folder or on the Python path. Commands that read its runs need --agent MODULE:CLASS.
 
-A run's folder holds config.json, metrics/ (a line of JSON for every entry), tensorboard/, checkpoints/, the trained
-agents, results.json and curve.png. Ctrl-C writes a checkpoint first. Mistakes end with one sentence and exit code 2.
+A run's folder contains config.json, metrics/ (a line of JSON for every entry), tensorboard/, checkpoints/, the trained
+agents, results.json and curve.png. Ctrl-C writes a checkpoint first. A mistake ends the command with an error message
+and exit code 2.
 """
 
 

@@ -1,4 +1,4 @@
-"""The types that the whole library shares: a timestep, a window of timesteps, a task's sizes, a user's mistake.
+"""Types for the whole library: a timestep, a window, a task's sizes, the error for a user's mistake (`UserError`).
 
 Axis names in shapes, everywhere: `seed` (one training each), `batch` (windows), `time` (timesteps of a window),
 `obs`, `action`, `belief` (input of the controller), `d` (recurrent state), `z` (latent variable), `x` (perception).
@@ -52,7 +52,7 @@ def _is_number(value: Any, whole: bool) -> bool:
 
 
 def check_indices(indices: Sequence[Any], size: int) -> None:
-    """Raise a UserError unless `indices` holds at least one index of an observation with `size` entries, each once."""
+    """Raise a UserError unless `indices` has at least one index of an observation with `size` entries, each once."""
     allowed = f"give indices from 0 to {size - 1}."
     for position, index in enumerate(indices):
         if not (_is_number(index, whole=True) and 0 <= index < size):
@@ -96,7 +96,7 @@ class Spec(NamedTuple):
     obs_dim: int  # numbers in an observation
     action_dim: int  # degrees of freedom; every action lies in [-1, 1]
     max_steps: int  # time limit of an episode: it truncates, it does not terminate
-    measures: tuple[str, ...] = ()  # what the task reports of an episode besides return and length, such as "success"
+    measures: tuple[str, ...] = ()  # further numbers that the task reports for an episode, such as "success"
 
 
 class Timestep(NamedTuple):

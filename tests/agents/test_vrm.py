@@ -237,7 +237,7 @@ def test_standardised_beliefs_are_what_the_controller_learns_from_and_acts_on(st
     np.testing.assert_allclose(action, agent.choose(after.controller, belief, jax.random.key(3), mode), rtol=1e-5)
 
 
-@pytest.mark.nightly
+@pytest.mark.slow
 def test_decoding_from_the_prior_and_sums_are_other_losses(state):
     window = windows(jax.random.key(1), 2)
     loss = {

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from beliefrl.models.nets import MLP
+from beliefrl.models.nets import MLP, gaussian_log_prob
 from beliefrl.models.soft_actor_critic import Actor, Batch, Controller, loss, soft_update
 from beliefrl.models.variational_model import VRM, elbo_terms
 
@@ -130,6 +130,27 @@ def test_elbo_equals_the_authors(vrm_numbers, elbo):
     close(np.asarray(terms.kl).T, vrm_numbers["kl"])
     close(np.asarray(terms.log_likelihood).T, vrm_numbers["log_likelihood"])
     close(value, vrm_numbers["negative_elbo"])
+
+
+def test_a_step_of_its_own_is_one_of_the_unroll(vrm_numbers, inputs, elbo):
+    vrm, (inferred, _) = vrm_from(with_weights(vrm_numbers, "w/")), elbo[0][1]
+    before = jax.tree.map(lambda leaf: leaf[2, 0], inferred.state)
+    after = jax.jit(lambda: vrm.next_state(before, inputs[0][3, 0], inferred.z[3, 0]))()
+    jax.tree.map(lambda ours, theirs: close(ours, theirs[3, 0]), after, inferred.state)
+
+
+def test_with_noise_of_the_prior_its_draws_are_decoded(vrm_numbers, inputs, elbo):
+    vrm, (inferred, _) = vrm_from(with_weights(vrm_numbers, "w/")), elbo[0][1]
+    x, action, _, noise = inputs
+
+    @jax.jit
+    def both():
+        prior = jax.vmap(jax.vmap(vrm.prior))(inferred.before, action)
+        decoded = jax.vmap(jax.vmap(vrm.decode))(inferred.before, prior.mean + prior.sigma * noise)
+        expected = jnp.mean(gaussian_log_prob(x, *decoded), axis=-1)
+        return elbo_terms(vrm, inferred, x, action, prior_noise=noise).log_likelihood, expected
+
+    close(*both())
 
 
 def test_gradient_of_the_elbo_equals_the_authors(vrm_numbers, elbo):

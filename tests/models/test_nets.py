@@ -80,6 +80,16 @@ def test_layers_start_in_pytorchs_bounds():
         assert float(jnp.std(layer.weight)) == pytest.approx(fan_in**-0.5 / 3**0.5, rel=0.05)
 
 
+def test_joint_layers_start_in_the_bounds_of_their_parts():
+    joint = jax.jit(lambda key: draw(key, variational_model.Joint(2, 100, 50, 40)))(jax.random.key(0))
+    parts = {100 + 2 + 40: (joint.w_d[:, :80], joint.w_features[:, :80], joint.w_action, joint.bias[:80])}
+    parts |= {100: (joint.w_d[:, 80:], joint.w_features[:, 80:], joint.w_z, joint.bias[80:])}
+    for fan_in, leaves in parts.items():
+        for leaf in leaves:
+            assert float(jnp.abs(leaf).max()) <= fan_in**-0.5
+            assert float(jnp.std(leaf)) == pytest.approx(fan_in**-0.5 / 3**0.5, rel=0.1)
+
+
 def test_rest_continues_from_the_first_layer():
     mlp, x = draw(jax.random.key(0), MLP((3, 8, 8, 2), jnp.tanh)), jnp.arange(3.0)
     np.testing.assert_array_equal(mlp(x), mlp.rest(mlp.layers[0](x)))

@@ -177,7 +177,7 @@ def test_it_reaches_every_phase_and_a_resumed_run_keeps_it(tmp_path, lowered, pr
 
 @pytest.mark.parametrize(
     "precision",
-    [pytest.param("float32", marks=pytest.mark.slow), pytest.param("tensorfloat32", marks=pytest.mark.nightly), None],
+    [*(pytest.param(name, marks=pytest.mark.nightly) for name in ASKED), pytest.param(None, marks=pytest.mark.slow)],
 )
 def test_what_is_made_of_a_run_has_its_precision(tmp_path, monkeypatch, precision):
     """None: of a run that was made before there was a choice."""

@@ -57,7 +57,9 @@ class Wrapped(gymnasium.Env):
         return np.asarray(obs), float(reward), *end, self._measures()
 
 
-@pytest.mark.parametrize("name", ["sac-mlp", pytest.param("vrm", marks=pytest.mark.nightly)])
+@pytest.mark.parametrize(
+    "name", [pytest.param("sac-mlp", marks=pytest.mark.slow), pytest.param("vrm", marks=pytest.mark.nightly)]
+)
 def test_the_host_loop_learns_what_the_compiled_loop_learns(name):
     agent, task = agents.make(name, **SHARED, **SMALL[name]), Hanging(max_steps=9)
     keys = jax.random.split(jax.random.key(0), 2)
@@ -155,7 +157,9 @@ def few(**changes):
     return {"steps": 40, "eval_every": 20, "eval_episodes": 2, "seeds": 2, "seed": 5} | changes
 
 
-@pytest.mark.parametrize("episodes", [2, pytest.param(3, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize(
+    "episodes", [pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.nightly)]
+)
 def test_a_training_goes_on_from_a_fault(tmp_path, episodes):
     """With two episodes its environment fails at step 27 of the training, with three in the first evaluation."""
     agent, notes = agents.make("sac-mlp", **SHARED, **SMALL["sac-mlp"]), []

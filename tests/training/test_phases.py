@@ -31,7 +31,7 @@ SMALL = {
 }
 
 
-MARKS = {"sac-mlp": (), "vrm": pytest.mark.slow}
+MARKS = {"sac-mlp": pytest.mark.slow, "vrm": pytest.mark.slow}
 
 
 @pytest.fixture(
@@ -52,7 +52,6 @@ def doubles():
 
 
 @pytest.mark.usefixtures("doubles")
-@pytest.mark.slow
 def test_a_seed_among_others_learns_as_it_does_alone_up_to_rounding(small):
     program, cycle = small
     keys = jax.random.split(jax.random.key(0), 3)
@@ -127,7 +126,7 @@ def counting(steps=120, task=None):
     return seeds, logged, counts
 
 
-@pytest.mark.nightly
+@pytest.mark.slow
 def test_every_window_of_a_training_is_unbroken():
     """The counter that the task shows is the agent's own count, through memory, resets, replay and its wrapping."""
     for task in (Counting(max_steps=7), Counting(ends=3), Counting(ends=1), Counting(max_steps=50)):

@@ -191,7 +191,7 @@ def test_no_window_is_drawn_where_nobody_sees_it(run, window, monkeypatch):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("DISPLAY", ":987")
     monkeypatch.setattr(window.display, "get_driver", lambda: "offscreen")
-    with pytest.raises(UserError, match=r"A window cannot be opened .*: write a film instead"):
+    with pytest.raises(UserError, match=r"A window cannot be opened .*: write a video instead"):
         films.video(run, None)
 
 

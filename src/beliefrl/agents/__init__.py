@@ -1,4 +1,4 @@
-"""Agents: what learns. A new agent is one file and one line in `catalogue.AGENTS`, or a user's class (`find_class`)."""
+"""The agents. A new agent is one file and one line in `catalogue.AGENTS`, or a user's class (`find_class`)."""
 
 import dataclasses
 import functools
@@ -22,9 +22,9 @@ Metrics = dict[str, Float[Array, ""]]
 class Agent(Protocol):
     """A frozen dataclass of hyperparameters whose methods are pure functions.
 
-    A training explores for `step_start_rl` steps with the untrained policy, calls `pretrain` `pretrain_updates` times,
-    and then goes in cycles of `cycle` steps: when these are done, `begin_cycle` once, then an `update` for each batch
-    that it gave.
+    A training explores for `step_start_rl` steps with the untrained policy, and calls `pretrain` `pretrain_updates`
+    times. Then it makes cycles of `cycle` steps. At the end of a cycle it calls `begin_cycle` once, and `update` for
+    each batch that `begin_cycle` returned.
     """
 
     @property
@@ -35,22 +35,22 @@ class Agent(Protocol):
     def cycle(self) -> int: ...
     @property
     def window(self) -> WindowShape:
-        """The windows that all of the methods below are given."""
+        """The shape of the windows that the methods below receive."""
         ...
 
     @property
     def losses(self) -> tuple[str, ...]:
-        """The metrics that end a seed where they are not finite; `pretrain` and the updates share these names."""
+        """The metrics that stop a seed if they are not finite; `pretrain` and the updates share these names."""
         ...
 
     @property
     def pretrain_windows(self) -> int:
-        """Number of windows that `pretrain` is given."""
+        """Number of windows that `pretrain` receives."""
         ...
 
     @property
     def cycle_windows(self) -> int:
-        """How many of them `begin_cycle` is given."""
+        """Number of windows that `begin_cycle` receives."""
         ...
 
     def init(self, key: Key[Array, ""], spec: Spec) -> Any:
@@ -60,8 +60,8 @@ class Agent(Protocol):
     def networks(self, state: Any) -> Any:
         """The state without what only updates need: its optimisers' fields are replaced by ().
 
-        It is what `act` and `predict` are given outside of training, what is saved as the trained agent, and what is
-        counted as parameters. `state` may have leading axes.
+        Outside of training, `act` and `predict` receive this state. It is saved as the trained agent, and its numbers
+        are counted as parameters. `state` may have leading axes.
         """
         ...
 
@@ -75,14 +75,15 @@ class Agent(Protocol):
     def act(
         self, state: Any, memory: Any, step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]
     ) -> tuple[Float[Array, " action"], Any]:
-        """Perceive a timestep; returns the action (a sample, or the mode where not `explore`) and the new memory.
+        """Perceive a timestep; returns the action (a sample, or the mode if not `explore`) and the new memory.
 
-        Where `step.is_first`, `memory` is already that of `reset`: this method need not look at `is_first` for it.
+        At the first timestep of an episode the caller passes the memory of `reset`, so this method need not check
+        `step.is_first` for it.
         """
         ...
 
     def note(self, memory: Any) -> Any:
-        """What the replay stores with a timestep, given the memory after it."""
+        """The data that the replay stores with a timestep, given the memory after it."""
         ...
 
     def pretrain(self, state: Any, windows: Window, key: Key[Array, ""]) -> tuple[Any, Metrics]:
@@ -90,7 +91,7 @@ class Agent(Protocol):
         ...
 
     def begin_cycle(self, state: Any, windows: Window, key: Key[Array, ""]) -> tuple[Any, Any, Metrics]:
-        """What is done once a cycle; the second result is a batch for every `update` to come (leading axis)."""
+        """Called once per cycle; the second result has a batch for each `update` of the cycle (leading axis)."""
         ...
 
     def update(self, state: Any, batch: Any, key: Key[Array, ""]) -> tuple[Any, Metrics]:
@@ -100,41 +101,41 @@ class Agent(Protocol):
 
 @runtime_checkable
 class Predictive(Protocol):
-    """An agent that has a model of what it perceives can be asked for its predictions; it need not."""
+    """An agent with a model that can predict its inputs. This protocol is optional."""
 
     @property
     def predictors(self) -> tuple[str, ...]:
-        """The names of its models, the one to be asked by default first."""
+        """The names of its models, the default first."""
         ...
 
     def predict(
         self, state: Any, model: str, step: Timestep, observed: Bool[Array, " time"], key: Key[Array, ""]
     ) -> Gaussian:
-        """What one of its models predicts of x_t = (o_t, r_{t-1}) along an episode, leaves (time, x).
+        """One model's predictions of x_t = (o_t, r_{t-1}) along an episode, leaves (time, x).
 
-        Open loop where x_t is `observed`: latent variables are inferred from it. Closed loop elsewhere: they are drawn
-        from the generative model, and x_t must not be used. Entries that the model does not predict are NaN.
+        Where x_t is `observed` (open loop), latent variables are inferred from it. Elsewhere (closed loop) they are
+        drawn from the generative model, and x_t must not be used. Entries that the model does not predict are NaN.
         """
         ...
 
 
-# Every name of ours, and the agent with the hyperparameters that the name stands for.
+# Every built-in name, and the agent with the hyperparameters that belong to this name.
 AGENTS: dict[str, Any] = {name: load(known.path)(**known.hyperparameters) for name, known in catalogue.AGENTS.items()}
 
 
 @functools.cache
 def defaults() -> dict[str, dict[str, Any]]:
-    """The hyperparameters of each of our agents as its name stands for them, as JSON has them."""
+    """The hyperparameters of each built-in name, in the form of JSON."""
     return {name: json.loads(json.dumps(dataclasses.asdict(agent))) for name, agent in AGENTS.items()}
 
 
 def find_class(name: str) -> type:
     """The class of the agent of that name, which may be `module:Class`.
 
-    Pass only names that the user gave: it may import a module.
+    Pass only names that the user gave, because this function may import a module.
 
     Raises:
-        UserError: no agent has that name, or the class is no agent.
+        UserError: no agent has that name, or the class is not an agent.
     """
     if name in AGENTS:
         return type(AGENTS[name])
@@ -145,10 +146,10 @@ def find_class(name: str) -> type:
 
 
 def check_class(kind: type) -> type:
-    """Check that a class is an agent's, and return it.
+    """Check that a class has everything that an agent needs, and return it.
 
     Raises:
-        UserError: it is no frozen dataclass, or lacks something that an agent has.
+        UserError: it is not a frozen dataclass, or lacks a member of an agent.
     """
     parameters = getattr(kind, "__dataclass_params__", None)
     if not (dataclasses.is_dataclass(kind) and parameters is not None and parameters.frozen):
@@ -161,10 +162,10 @@ def check_class(kind: type) -> type:
 
 
 def find(name: str) -> Any:
-    """The agent of that name with the hyperparameters that the name stands for; see `find_class`.
+    """The agent of that name with the hyperparameters that belong to this name; see `find_class`.
 
     Raises:
-        UserError: no agent has that name, or the class is no agent or has a hyperparameter without a default.
+        UserError: no agent has that name, or the class is not an agent, or a hyperparameter has no default.
     """
     agent = named(name)
     return build(agent, {}, name) if isinstance(agent, type) else agent
@@ -174,7 +175,8 @@ def make(name: str, /, **hyperparameters: Any) -> Agent:
     """The agent of that name; `hyperparameters` replace its defaults.
 
     Args:
-        name: of one of ours or of an installed package, or `module:Class` for an agent of your own, which is imported.
+        name: a built-in name, a name of an installed package, or `module:Class` for an agent of your own, which is
+            imported.
 
     Raises:
         UserError: no agent has that name, it has no such hyperparameter, or a value is impossible.
@@ -183,7 +185,7 @@ def make(name: str, /, **hyperparameters: Any) -> Agent:
 
 
 def named(name: str) -> Any:
-    """What a name stands for: of ours an agent with the hyperparameters of that name, of others the class.
+    """For a built-in name the agent with its hyperparameters; for another name the class.
 
     Raises:
         UserError: as `find_class`.
@@ -192,9 +194,9 @@ def named(name: str) -> Any:
 
 
 def name_of(agent: Agent) -> str:
-    """The name under which `make` finds an agent; module:Class for one that is neither ours nor of an entry point.
+    """The name under which `make` finds an agent; module:Class if it is neither built in nor declared by a package.
 
-    Of names that share a class (the ablations) it is the one whose own settings the agent has.
+    If several names share the class (the ablations), it is the name whose settings the agent has.
     """
     found = None
     for name, known in AGENTS.items():
@@ -206,7 +208,7 @@ def name_of(agent: Agent) -> str:
 
 
 def is_own(name: str) -> bool:
-    """Whether it is `module:Class`: a user's own agent, which only a user may name."""
+    """Whether the name is `module:Class`: a user's own agent, which only a user may name."""
     return ":" in name
 
 

@@ -1,4 +1,7 @@
-"""The base class of the agents: the hyperparameters of Table 1 and the soft actor-critic that they describe."""
+"""Base classes of the agents: `ControllerAgent` (all agents) and `SACAgent` (the paper's).
+
+Together they have the hyperparameters of Table 1, and the soft actor-critic that these describe.
+"""
 
 import dataclasses
 from typing import Any
@@ -23,7 +26,7 @@ from beliefrl.models.soft_actor_critic import (
 )
 from beliefrl.types import LARGEST, WIDEST, Window, WindowShape, check_choice, check_range, transitions
 
-MOST_STEPS = 64  # of a return; each is compiled
+MOST_STEPS = 64  # of an n-step return; each step is compiled
 Metrics = dict[str, Float[Array, ""]]
 
 
@@ -46,9 +49,9 @@ class ControllerAgent:
     lr_alpha: float = 3e-4
     """Adam's learning rate for log α, the temperature (Table 1)."""
     target_entropy: float | None = None
-    """Entropy that α aims at; None is minus the number of actions (Table 1)."""
+    """Target entropy of the policy; None is minus the number of action dimensions (Table 1)."""
     tau: float = 0.005
-    """Fraction by which the target V moves at each update, in [0, 1] (Table 1)."""
+    """Soft-update rate of the target network, in [0, 1] (Table 1)."""
     policy_layers: tuple[int, ...] = (256, 256)
     """Hidden layers of μ and log σ of the policy (Table 1)."""
     value_layers: tuple[int, ...] = (256, 256)
@@ -83,7 +86,7 @@ class ControllerAgent:
 
     @property
     def cycle(self) -> int:
-        """Environment steps between two visits to the replay."""
+        """Environment steps in a cycle: the agent learns at the end of each cycle."""
         return self.train_interval_rl
 
     @property
@@ -119,8 +122,8 @@ class ControllerAgent:
         Args:
             windows: as the replay returns them.
             belief: at the length + 1 timesteps after the burn-in.
-            next_belief: what V̄ reads at these timesteps; None: `belief`.
-            actor_input: what the actor reads there; None: `belief`.
+            next_belief: the inputs of V̄ at these timesteps; None: `belief`.
+            actor_input: the inputs of the actor at these timesteps; None: `belief`.
         """
         burn_in = self.window.burn_in
         after = belief if next_belief is None else next_belief
@@ -153,13 +156,13 @@ class SACAgent(ControllerAgent):
 
     @property
     def losses(self) -> tuple[str, ...]:
-        """The metrics that end a seed if they are not finite."""
+        """The metrics that stop a seed if they are not finite."""
         return "loss_value", "loss_q", "loss_actor"
 
     def init_controller(
         self, key: Key[Array, ""], belief: int, action: int, actor_size: int | None = None
     ) -> tuple[Controller, OptimiserState]:
-        """A new controller and its optimisers; `actor_size` is the actor's input size where that is not the belief."""
+        """A new controller and its optimisers; `actor_size` is the actor's input size if it is not the belief."""
         sizes = belief, action, self.policy_layers, self.value_layers
         controller = init_controller(*sizes, key, actor_size, self.value_start)
         return controller, init_optimisers(self.optimisers, controller)
@@ -167,7 +170,7 @@ class SACAgent(ControllerAgent):
     def controller_loss(
         self, controller: Controller, batch: Batch, key: Key[Array, ""]
     ) -> tuple[Float[Array, ""], Metrics]:
-        """The four losses of soft actor-critic, summed; and what to log."""
+        """The sum of the four losses of soft actor-critic, and the metrics."""
         noise = jax.random.normal(key, batch.action.shape)
         return loss(controller, batch, noise, self.actor_regulariser, self.target_entropy)
 
@@ -181,7 +184,10 @@ class SACAgent(ControllerAgent):
 
 
 def standardise_beliefs(scale: RunningStatistics | None, batch: Batch) -> tuple[RunningStatistics | None, Batch]:
-    """The scale after a batch (or those of a cycle), and the batch standardised by it; without a scale, as it is."""
+    """The statistics after a batch (or a cycle's batches), and the batch standardised with them.
+
+    Without statistics the batch is returned unchanged.
+    """
     if scale is None:
         return None, batch
     scale = update_statistics(scale, batch.belief, batch.valid)
@@ -190,10 +196,10 @@ def standardise_beliefs(scale: RunningStatistics | None, batch: Batch) -> tuple[
 
 
 def for_each_update(windows: Any, count: int) -> Any:
-    """A cycle's windows for each of its updates: (time, update · count, ...) to (update, time, count, ...)."""
+    """Split a cycle's windows into those of each update: (time, update · count, ...) to (update, time, count, ...)."""
     return jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0], -1, count, *leaf.shape[2:]).swapaxes(0, 1), windows)
 
 
 def split_updates(batch: Any, count: int) -> Any:
-    """A cycle's transitions for each of its updates: (time, update · count, ...) to (update, time · count, ...)."""
+    """Split a cycle's transitions by update: (time, update · count, ...) to (update, time · count, ...)."""
     return jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0], -1, *leaf.shape[3:]), for_each_update(batch, count))

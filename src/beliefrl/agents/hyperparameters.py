@@ -1,6 +1,6 @@
-"""The hyperparameters of an agent, ours or a user's: set, recorded as JSON has them, and restored from that.
+"""The hyperparameters of an agent, built in or a user's: set, recorded as JSON, and restored from the record.
 
-A `Range` says which values `beliefrl.tune` tries.
+A `Range` defines the values that `beliefrl.tune` tries.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ Scale = Literal["linear", "log", "horizon"]
 class Range:
     """The numbers from `low` to `high`, which `beliefrl.tune` tries for a hyperparameter.
 
-    An agent has a class attribute `ranges`: for each hyperparameter that is tuned a Range, or a tuple of values.
+    The class attribute `ranges` of an agent has a Range, or a tuple of values, for each hyperparameter that is tuned.
     """
 
     low: int | float
@@ -28,8 +28,8 @@ class Range:
     high: int | float
     """The highest number."""
     scale: Scale | None = None
-    """What is drawn uniformly: linear, the number; log, its logarithm; horizon, log(1 - number), as for a discount
-    factor γ, whose horizon is 1 / (1 - γ). None: the scale of the agent's own range, otherwise linear."""
+    """The quantity that is drawn uniformly: the number (linear), its logarithm (log), or log(1 - number) (horizon),
+    as for a discount factor γ with the horizon 1 / (1 - γ). None: the scale of the agent's own range, or linear."""
 
 
 Ranges = Mapping[str, Range | Sequence[Any]]
@@ -38,7 +38,7 @@ Ranges = Mapping[str, Range | Sequence[Any]]
 def build(agent: Any, hyperparameters: Mapping[str, Any], name: str | None = None) -> Any:
     """An agent like this one, or of this class, in which these hyperparameters replace its own.
 
-    `name` is what messages call it; None is the path of its class.
+    `name` is the agent's name in messages; None is the path of its class.
 
     Raises:
         UserError: it has no such hyperparameter, lacks one that has no default, or a value is impossible.
@@ -59,14 +59,14 @@ def build(agent: Any, hyperparameters: Mapping[str, Any], name: str | None = Non
         return make(**hyperparameters)
     except UserError:
         raise
-    except Exception as error:  # whatever an agent of a user's may raise
+    except Exception as error:  # an agent of a user may raise anything
         if kind.__module__.startswith("beliefrl."):
             raise
         raise UserError(f"The agent {name} cannot be made with its hyperparameters: {said(error)}.") from None
 
 
 def of(agent: Any) -> dict[str, Any]:
-    """What an agent was made with; dataclasses in it are dictionaries."""
+    """The hyperparameters of an agent; nested dataclasses become dictionaries."""
     values = dataclasses.asdict(agent)
     return {field.name: values[field.name] for field in dataclasses.fields(agent) if field.init}
 
@@ -74,7 +74,7 @@ def of(agent: Any) -> dict[str, Any]:
 def restored(agent: Any, recorded: Mapping[str, Any]) -> Any:
     """An agent like this one, or of this class, with hyperparameters that were recorded as JSON.
 
-    JSON cannot hold some values, such as functions. There the agent's own are kept.
+    JSON cannot represent some values, such as functions. For these the agent keeps its own values.
 
     Raises:
         UserError: as `build`.

@@ -1,16 +1,17 @@
 """Predictive SAC: a soft actor-critic on the state of one LSTM that learns only to predict.
 
-The belief is s_t = [h_t, x_t], h_t the LSTM's state and x_t = (o_t, a_{t-1}, r_{t-1}), all standardised by running
-statistics. The LSTM learns all the time and only by predicting the next observation and reward
-(`models.predictive_model`); the controller (`models.double_q`) learns on the belief and sends no gradient back.
+The belief is s_t = [h_t, x_t], with the LSTM's state h_t and x_t = (o_t, a_{t-1}, r_{t-1}), all standardised by
+running statistics. The LSTM learns during the whole training, and only by predicting the next observation and reward
+(`models.predictive_model`). The controller (`models.double_q`) learns on the belief. Its gradient does not reach the
+LSTM.
 
 This agent is not from the paper. It keeps the paper's idea: a recurrent model that learns by prediction forms the
 belief, and a soft actor-critic acts on it. It differs from `vrm` in this: one model instead of two, without latent
 variables and without a frozen copy; standardised inputs; returns of several steps; no V.
 
-One unroll serves both: the windows of a cycle teach the model, and the beliefs formed on the way become transitions.
-These go into a pool that holds those of the last `pool` cycles, and the controller's batches are drawn from it: the
-windows of one cycle are too few and too much alike for a batch.
+One unroll of the windows of a cycle serves both: the model learns from it, and its beliefs become transitions. A pool
+has the transitions of the last `pool` cycles, and the controller's batches are drawn from it. The windows of one cycle
+are too few and too correlated for a batch.
 """
 
 import dataclasses
@@ -85,7 +86,7 @@ class PredictiveSACAgent(ControllerAgent):
     alpha_start: float = 0.1
     """α before training, in units of the returns."""
     tau: float = 0.005
-    """Fraction by which the target Qs move at each update, in [0, 1]."""
+    """Soft-update rate of the target Qs, in [0, 1]."""
     policy_layers: tuple[int, ...] = (128, 128)
     """Hidden layers of the actor."""
     value_layers: tuple[int, ...] = (128, 128)
@@ -103,17 +104,17 @@ class PredictiveSACAgent(ControllerAgent):
     sequences: int = 8
     """Sequences in an update of the model."""
     burn_in: int = 32
-    """Maximum number of steps before a sequence that initialise its state, from zero."""
+    """Burn-in: at most this many steps before a sequence initialise its state, from zero."""
     d_size: int = 128
     """Size of the LSTM's state h."""
     hidden_size: int = 128
     """Width of the predictor's hidden layer."""
     long_memories: float = 0.25
-    """Fraction of the LSTM's cells that begin with a long memory, in [0, 1]."""
+    """Fraction of the LSTM's cells that start with a long memory, in [0, 1]."""
     longest_memory: int = 127
-    """Steps over which the slowest of these cells forgets when training begins."""
+    """Steps over which the slowest of these cells forgets at the start of the training."""
     pool: int = 8
-    """Cycles whose transitions the controller's batches are drawn from."""
+    """Number of the last cycles whose transitions are in the pool."""
 
     ranges = ControllerAgent.ranges | {
         "batch_size": (64, 128, 256, 512),
@@ -209,7 +210,7 @@ class PredictiveSACAgent(ControllerAgent):
         return state, metrics
 
     def learn_model(self, state: State, windows: Window) -> tuple[State, Float[Array, "kept batch belief"], Metrics]:
-        """One Adam step on J_model; beside it the beliefs from the end of the burn-in on, formed before the step."""
+        """One Adam step on J_model; also returns the beliefs after the burn-in, formed before the step."""
         scales, step = state.scales, windows.step
         obs = update_statistics(scales.obs, step.obs, windows.exists)
         reward = update_statistics(scales.reward, step.reward[..., None], windows.exists & ~step.is_first)
@@ -256,13 +257,13 @@ class PredictiveSACAgent(ControllerAgent):
 
 
 def add(pool: Pool, batch: Batch) -> Pool:
-    """The pool with the transitions of one more cycle; the oldest cycle's make room."""
+    """The pool with the transitions of one more cycle, which replace those of the oldest cycle."""
     index = pool.cycles % len(pool.transitions.reward)
     return Pool(jax.tree.map(lambda ring, new: ring.at[index].set(new), pool.transitions, batch), pool.cycles + 1)
 
 
 def draw(pool: Pool, key: Key[Array, ""], shape: tuple[int, int]) -> Batch:
-    """Transitions drawn uniformly, leaves (*shape, ...); those that are not `valid` are drawn as well."""
+    """Transitions drawn uniformly, leaves (*shape, ...); they include transitions that are not `valid`."""
     cycles, count = pool.transitions.reward.shape
     index = jax.random.randint(key, shape, 0, jnp.minimum(pool.cycles, cycles) * count)
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[index], pool.transitions)

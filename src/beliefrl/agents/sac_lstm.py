@@ -1,11 +1,12 @@
-"""SAC-LSTM: a soft actor-critic on the state of an LSTM, both trained by the losses of the controller, end to end.
+"""SAC-LSTM: a soft actor-critic on the state of an LSTM. The controller's losses train both, end to end.
 
 Source: Section 5, Table 1, Appendix A.2.2 and A.1.2. The belief is d_t = LSTM(d_{t-1}; o_t). Sequences, burn-in and
-resets inside windows are those of VRM; the gradients of J_π (through μ and log σ), J_V and J_Q reach the LSTM, those
-through the targets and through the Q of the actor's loss do not.
+resets inside windows are those of VRM. The gradients of J_π (through μ and log σ), J_V and J_Q reach the LSTM. The
+gradients through the targets and through the Q of the actor's loss do not.
 
-Departure: V̄ reads the state of a target LSTM, which moves as V̄ does. With the state of the LSTM that learns, as in the
-authors' code, the target moves with every update, and what was learned is lost again (docs/agents/alternatives.md).
+Departure: V̄ reads the state of a target LSTM, which moves together with V̄. In the authors' code it reads the state of
+the learning LSTM, so the target moves with every update. In our runs such agents learned and then forgot
+(docs/agents/alternatives.md).
 """
 
 import dataclasses
@@ -41,17 +42,17 @@ class SACLSTMAgent(SACAgent):
     batch_size: int = 4
     """Sequences in an update (Appendix A.1.2)."""
     burn_in: int = 64
-    """Maximum number of steps before a sequence that initialise its state, from zero (Appendix A.1.2)."""
+    """Burn-in: at most this many steps before a sequence initialise its state, from zero (Appendix A.1.2)."""
     d_size: int = 256
     """Size of the LSTM's state (Appendix A.2.2)."""
     lr_lstm: float = 3e-4
     """Adam's learning rate for the LSTM, which learns from the critics and from the actor in turn (authors' code)."""
     pretrain_updates: int = 5000
-    """Updates of the whole agent after step_start_rl steps, as many as VRM's pre-training has (Section 5; 0 is off)."""
+    """Updates of the whole agent after step_start_rl steps, as many as in VRM's pre-training (Section 5; 0 is off)."""
     perceive_action: bool = False
-    """Let the LSTM perceive the previous action beside the observation (the paper's does not)."""
+    """Make the previous action an input of the LSTM, in addition to the observation (not in the paper)."""
     perceive_reward: bool = False
-    """Let the LSTM perceive the previous reward beside the observation (the paper's does not)."""
+    """Make the previous reward an input of the LSTM, in addition to the observation (not in the paper)."""
 
     ranges = SACAgent.ranges | {
         "lr_lstm": Range(1e-4, 3e-3, "log"),
@@ -103,7 +104,7 @@ class SACLSTMAgent(SACAgent):
     # Acting
 
     def perception(self, step: Timestep) -> Float[Array, "*batch x"]:
-        """o_t, with the action and the reward before it where they are perceived."""
+        """o_t, with the last action and the last reward if they are inputs."""
         parts = [step.obs]
         if self.perceive_action:
             parts.append(step.prev_action)
@@ -135,7 +136,7 @@ class SACLSTMAgent(SACAgent):
         return state, for_each_update(windows, self.batch_size), {}
 
     def beliefs(self, lstm: LSTM, windows: Window) -> Float[Array, "time batch d"]:
-        """d_t from the end of the burn-in on; no gradient goes into the burn-in."""
+        """d_t after the burn-in; no gradient reaches the burn-in."""
         before, after = windows.between(0, self.burn_in), windows.between(self.burn_in, None)
         start = lstm.start(self.batch_size)
         if self.burn_in:
@@ -158,7 +159,7 @@ class SACLSTMAgent(SACAgent):
     def gradients(
         self, lstm: LSTM, target_lstm: LSTM, controller: Controller, windows: Window, key: Key[Array, ""]
     ) -> tuple[tuple[LSTM, LSTM, Controller], Metrics]:
-        """Of J_V + J_Q in the LSTM, of J_π in the LSTM, and of all losses in the controller."""
+        """The gradients of J_V + J_Q in the LSTM, of J_π in the LSTM, and of all losses in the controller."""
 
         def loss(d: Array, d_actor: Array, controller: Controller) -> tuple[Float[Array, ""], Metrics]:
             return self.controller_loss(controller, self.batch(windows, d, d_actor, d_target), key)

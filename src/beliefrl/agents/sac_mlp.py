@@ -1,7 +1,7 @@
 """SAC-MLP: a soft actor-critic on the observation alone, without memory (Haarnoja et al. 2018, 2019).
 
 Source: Section 5, Table 1, Appendix A.2.1. The belief is o_t. This agent has no memory, so its returns show
-how much a task hides.
+how much the task needs memory.
 """
 
 import dataclasses
@@ -21,7 +21,7 @@ class State(NamedTuple):
 
     controller: Controller
     controller_optimiser: OptimiserState
-    scale: RunningStatistics | None  # of observations, where they are standardised
+    scale: RunningStatistics | None  # of observations, if they are standardised
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,7 +31,7 @@ class SACMLPAgent(SACAgent):
     batch_size: int = 256
     """Transitions in an update (Appendix F: as many as the other agents')."""
     pretrain_updates: int = 5000
-    """Updates of the controller at step_start_rl, as many as VRM's pre-training has (Section 5; 0 is off)."""
+    """Updates of the controller after step_start_rl steps, as many as in VRM's pre-training (Section 5; 0 is off)."""
     standardise: bool = False
     """Standardise the controller's observations to mean 0 and deviation 1, by running statistics."""
 
@@ -45,7 +45,7 @@ class SACMLPAgent(SACAgent):
 
     @property
     def window(self) -> WindowShape:
-        """One transition and what follows it; it is masked where an episode ends between its two timesteps."""
+        """Two timesteps. They are not a transition, and are masked, if an episode ends between them."""
         return WindowShape(burn_in=0, length=self.n_step)
 
     @property

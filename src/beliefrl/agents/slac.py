@@ -1,13 +1,13 @@
 """SLAC: critics on the latent state of a learned model, an actor on the last observations (Lee et al. 2019).
 
 Source: Lee et al. 2019, Sections 4 and 5; Han, Doya, Tani 2020, Section 5 and Appendix A.2.3. The model
-(`latent_model`) is pre-trained and then learns at every step. Q and V read z²_t, the actor the last eight
-x_t = (o_t, r_{t-1}), in which an episode's first stands for what was before it.
+(`latent_model`) is pre-trained and then learns at every step. Q and V read z²_t. The actor reads the last eight
+x_t = (o_t, r_{t-1}). At the start of an episode the first x_t is repeated.
 
-Departures: z²_t is inferred from four timesteps before a sampled sequence on, so that the critics' beliefs rest on 5 to
-12 timesteps; Lee et al. take one transition from each sequence, behind 8. The beliefs of an update are inferred with
-the model as it was before its own update of that step, so that the two can run side by side. The model's own
-departures are in `latent_model`.
+Departures: the inference of z²_t starts four timesteps before a sampled sequence. So the critics' beliefs depend on 5
+to 12 timesteps. Lee et al. take one transition from each sequence, after 8 timesteps. The beliefs of an update are
+inferred with the model before its own update of that step, so that the two computations can run side by side. The
+departures of the model are in `latent_model`.
 """
 
 import dataclasses
@@ -55,7 +55,7 @@ class SLACAgent(SACAgent):
     train_interval_model: int = 1
     """Environment steps between two updates of the model (Lee et al. 2019)."""
     pretrain_updates: int = 5000
-    """Updates of the model at step_start_rl, as many as VRM's pre-training has (Section 5; 0 is off)."""
+    """Updates of the model after step_start_rl steps, as many as in VRM's pre-training (Section 5; 0 is off)."""
     elbo_scaling: Literal["mean", "sum"] = "mean"
     """Mean (the authors' code) or sum (the formula) over the dimensions of z¹, and of observation and reward."""
 
@@ -206,7 +206,7 @@ class SLACAgent(SACAgent):
     def histories(self, step: Timestep) -> Float[Array, "length batch actor_input"]:
         """The actor's input at each timestep after the burn-in of windows (time-major)."""
         x, time = perception(step), jnp.arange(step.reward.shape[0])
-        begun = jax.lax.cummax(jnp.where(step.is_first, time[:, None], 0))  # when the timestep's episode began
+        begun = jax.lax.cummax(jnp.where(step.is_first, time[:, None], 0))  # index of the episode's first timestep
         back = time[self.history - 1 :, None] - jnp.arange(self.history)[::-1][None]
         index = jnp.maximum(back[:, :, None], begun[self.history - 1 :, None])  # (length, history, batch)
         actor_input = x[index, jnp.arange(x.shape[1])].swapaxes(1, 2)
@@ -218,7 +218,7 @@ class SLACAgent(SACAgent):
 
 
 def begin_windows(windows: Window) -> Window:
-    """Windows (time-major) whose first timestep counts as an episode's first."""
+    """The windows (time-major), with their first timestep marked as the first of an episode."""
     step = windows.step
     step = step._replace(is_first=step.is_first.at[0].set(True), prev_action=step.prev_action.at[0].set(0.0))
     return windows._replace(step=step)

@@ -2,15 +2,16 @@
 
 Source: Section 4, Algorithm 1, Tables 1 and 2, Appendix A.1; the ablations: Appendix C. The belief is
 s_t = [d_t of the first-impression model, d_t of the keep-learning model, x_t] with x_t = (o_t, r_{t-1}). The first
-model is pre-trained once and then never changes; the second learns throughout; the controller learns on the belief
-and sends no gradient back. In an ablation the belief has the d_t of one model, or both models are deterministic.
+model is pre-trained once and does not change afterwards. The second learns during the whole training. The controller
+learns on the belief, and its gradient does not reach the models. In an ablation the belief has the d_t of one model, or
+both models are deterministic.
 
 Departures:
-1. The first-impression d_t is computed once, when it is perceived, and kept in the replay (`store_first_impression`):
-   the model does not change any more, so only the sample of z is not drawn anew.
-2. A cycle of `train_interval_klvrm` steps makes its updates at its end: one of the keep-learning model, then those of
-   the controller. In between the model stands still, so one unroll gives the beliefs for all of them.
-3. A mode action is also a mode of the belief: z is the posterior's mean where the agent does not explore.
+1. The first-impression model's d_t is computed once, when the timestep is perceived, and stored in the replay
+   (`store_first_impression`). The model does not change any more, so the only difference is that z is not sampled anew.
+2. All updates of a cycle of `train_interval_klvrm` steps are made at its end: first one of the keep-learning model,
+   then those of the controller. The model does not change between the latter, so one unroll gives all their beliefs.
+3. If the agent does not explore, z is the posterior's mean, so that a mode action also has a belief without noise.
 """
 
 import dataclasses
@@ -44,7 +45,7 @@ class State(NamedTuple):
     first_optimiser: optax.OptState
     keep_optimiser: optax.OptState
     controller_optimiser: OptimiserState
-    scale: RunningStatistics | None  # of beliefs, where they are standardised
+    scale: RunningStatistics | None  # of beliefs, if they are standardised
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,7 +66,7 @@ class VRMAgent(SACAgent):
 
     # Appendix A.1
     burn_in: int = 64
-    """Maximum number of steps before a sequence that initialise its state, from zero (Appendix A.1.2)."""
+    """Burn-in: at most this many steps before a sequence initialise its state, from zero (Appendix A.1.2)."""
     d_size: int = 256
     """Size of the recurrent state d of each model (Appendix A.1.1)."""
     z_size: int = 64
@@ -78,17 +79,17 @@ class VRMAgent(SACAgent):
     """Both models; a single one that is pre-trained and keeps learning; only the first-impression model; or only
     the keep-learning model, which is not pre-trained."""
     deterministic: bool = False
-    """Models without noise, which predict x by its mean-squared error in place of the ELBO."""
+    """Models without noise. Their loss is the mean squared error of the predicted x, in place of the ELBO."""
 
     # What the paper leaves open
     elbo_scaling: Literal["mean", "sum"] = "mean"
     """Mean (the authors' code; lr_model was tuned on it) or sum (the formula) over the dimensions of z and x."""
     decode_from: Literal["posterior", "prior"] = "posterior"
-    """What z is drawn from to decode x in training: the posterior (a true ELBO) or the prior (the authors' code)."""
+    """Distribution of z when x is decoded in training: posterior (a true ELBO) or prior (the authors' code)."""
     store_first_impression: bool = True
-    """Keep the first-impression model's d in the replay instead of computing it again for every update."""
+    """Store the first-impression model's d in the replay, and do not compute it again for every update."""
     sample_belief: bool = True
-    """Form beliefs with a sample of z, as in training the models; if False, with the posterior's mean."""
+    """Form beliefs with a sample of z, as in the training of the models; if False, with the posterior's mean."""
     standardise: bool = False
     """Standardise the controller's beliefs to mean 0 and deviation 1, by running statistics."""
 
@@ -124,7 +125,7 @@ class VRMAgent(SACAgent):
 
     @property
     def has_keep(self) -> bool:
-        """Whether there is a keep-learning model, which is trained throughout."""
+        """Whether there is a keep-learning model, which is updated during the whole training."""
         return self.models != "first"
 
     @property
@@ -149,7 +150,7 @@ class VRMAgent(SACAgent):
 
     @property
     def cycle_windows(self) -> int:
-        """One batch for the model that keeps learning and one for each update of the controller."""
+        """One batch for the keep-learning model and one for each update of the controller."""
         return self.batch_size * (self.has_keep + self.cycle_updates)
 
     @property
@@ -227,7 +228,7 @@ class VRMAgent(SACAgent):
         return state._replace(first=first, first_optimiser=optimiser), metrics
 
     def learn_keep(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Metrics]:
-        """One update of the model that keeps learning, where there is one."""
+        """One update of the keep-learning model, if there is one."""
         if state.keep is None:
             return state, {}
         keep, optimiser, metrics = self.learn_model(state.keep, state.keep_optimiser, windows, key)

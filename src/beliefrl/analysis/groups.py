@@ -56,7 +56,7 @@ class Group:
 
     @property
     def measures(self) -> list[str]:
-        """What is recorded of an episode besides return and length, such as "success"."""
+        """The numbers that are recorded for an episode besides return and length, such as "success"."""
         names = dict.fromkeys(name for rows in self.evaluations for row in rows for name in row)
         return [name.removeprefix("sampled_") for name in names if name.startswith("sampled_")]
 
@@ -124,7 +124,7 @@ def groups(runs: Sequence[Run], defaults: Mapping[str, Row] | None = None) -> li
     """The runs' seeds, grouped; tasks and agents keep the order in which they first occur.
 
     `defaults` are the default settings of each agent by name (`agents.defaults`). They fill in settings that a run
-    lacks because it is older than they are. A setting with its default value is not shown in a label.
+    lacks because it is older than these settings. A setting with its default value is not shown in a label.
 
     If a seed was trained several times with the same settings, only the run with the most steps counts, and among equal
     ones the latest: equal seed numbers give equal trainings, which must not count as several samples.

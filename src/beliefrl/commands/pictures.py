@@ -13,7 +13,7 @@ import tyro
 
 from beliefrl.commands.arguments import Best, OwnAgent, own_agent, parse
 
-SPARING = 20.0  # frames per second of a demo's film at most, so that it is written in seconds
+SPARING = 20.0  # maximum frames per second of a demo's video, so that it is written in seconds
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,18 +94,17 @@ class FilmOptions:
 
 @dataclasses.dataclass(frozen=True)
 class DemoOptions:
-    """Watch a small trained agent that comes with the package: in a window, or in a film if there is no display."""
+    """Watch a small trained agent that comes with the package: in a window, or in a video if there is no display."""
 
     task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="[TASK]")] = "pendulum-v"
     """cartpole-v, pendulum-v or target-reaching."""
     out: Annotated[pathlib.Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """The film to write, .gif or .mp4. An existing file is replaced. None: a window if there is a display and pygame
+    """The video to write, .gif or .mp4. An existing file is replaced. None: a window if there is a display and pygame
     (extra `render`), otherwise beliefrl-demo-TASK.gif."""
     episode_seed: int = 4
     """Random seed of the episode. The same seed gives the same episode."""
     unpack: Annotated[pathlib.Path | None, tyro.conf.arg(metavar="RUN")] = None
-    """A new folder, into which the agent is copied as a run, for commands such as `beliefrl evaluate RUN`. None: it is
-    not copied."""
+    """A new folder for a copy of the agent, as a run for commands such as `beliefrl evaluate RUN`. None: no copy."""
 
 
 def predict(argv: Sequence[str]) -> None:

@@ -1,1 +1,1 @@
-"""Networks and equations: pure functions of weights and arrays, which know no agent, task or file."""
+"""Networks and equations: pure functions of weights and arrays; they depend on no agent, task or file."""

@@ -1,16 +1,16 @@
 """Soft actor-critic without V, in units of its own returns: the controller of `predictive-sac`.
 
-Source: Haarnoja et al. 2019, Algorithm 1, with s the belief and s' the one m steps later (`returns`):
+Source: Haarnoja et al. 2019, Algorithm 1, where s is the belief and s' is the belief m steps later (`returns`):
 
     y   = r + γ^m (1 - terminated) min_i Q̄_i(s', ã')
     J_Q = E ½ ((Q_i(s, a) - y) / u)²,  summed over i
     J_π = E α log π(ã|s) - min_i Q_i(s, ã) / u  +  regulariser · ½ E μ²
     J_α = E -log α (log π(ã|s) + H_target)
 
-u is a running root mean square of y. The networks of the critics give Q / u, and their last layers are rescaled when u
-changes, so that Q stays the same (van Hasselt et al. 2016, without their mean). So one learning rate and one
-temperature fit tasks with returns of any size. Departure: y holds no entropy. Over a horizon of 200 steps that would be
-more than the rewards of most tasks, and with α in units of u it would be a feedback of u on itself.
+u is a running root mean square of y. The networks of the critics return Q / u. When u changes, their last layers are
+rescaled, so that Q stays the same (van Hasselt et al. 2016, without their mean). So one learning rate and one
+temperature fit tasks with returns of any size. Departure: y does not contain the entropy. Over a horizon of 200 steps
+the sum of entropies would exceed the rewards of most tasks. And because α is in units of u, u would influence itself.
 """
 
 import math
@@ -36,7 +36,7 @@ from beliefrl.models.soft_actor_critic import (
     wanted_entropy,
 )
 
-UNIT_RATE = 1e-3  # least weight of a new batch in u², reached after 1 / rate batches
+UNIT_RATE = 1e-3  # smallest weight of a new batch in u², reached after 1 / rate batches
 UNIT_MIN = 1e-4
 
 
@@ -57,7 +57,7 @@ class Actor(eqx.Module):
 class Unit(NamedTuple):
     """u, the size of returns."""
 
-    square: Float[Array, ""]  # u², an average over batches, exponential after 1 / UNIT_RATE of them
+    square: Float[Array, ""]  # u², an average over batches; an exponential average after 1 / UNIT_RATE batches
     batches: Float[Array, ""]  # so far
 
     @property
@@ -116,7 +116,7 @@ def target(controller: Controller, batch: Batch, key: Key[Array, ""]) -> Float[A
 
 
 def rescale(controller: Controller, y: Float[Array, " batch"], valid: Bool[Array, " batch"]) -> Controller:
-    """The controller with the targets of one more batch in u, and the same Q."""
+    """The controller with u updated by the targets of one more batch; Q stays the same."""
     old = controller.unit
     rate = jnp.maximum(1 / (old.batches + 1), UNIT_RATE)
     new = Unit(old.square + rate * (valid_mean(y**2, valid) - old.square), old.batches + 1)
@@ -143,7 +143,7 @@ def q_loss(
 def actor_loss(
     actor: Actor, controller: Controller, batch: Batch, key: Key[Array, ""], regulariser: float
 ) -> tuple[Float[Array, ""], tuple[Float[Array, " batch"], Float[Array, " batch"]]]:
-    """J_π; beside it min_i Q_i(s, ã) / u and log π(ã|s)."""
+    """J_π; also returns min_i Q_i(s, ã) / u and log π(ã|s)."""
     action, log_prob, mean = sample(actor, batch.belief, key)
     q = least(controller.critics, batch.belief, action)
     size = 0.5 * regulariser * jnp.mean(mean**2, axis=-1)
@@ -160,7 +160,10 @@ def update(
     regulariser: float,
     target_entropy: float | None = None,
 ) -> tuple[Controller, OptimiserState, dict[str, Float[Array, ""]]]:
-    """One step of every optimiser, then of Q̄ towards the new Q; `target_entropy` None is minus the actions."""
+    """One step of every optimiser, then a soft update of Q̄.
+
+    `target_entropy` None is minus the number of action dimensions.
+    """
     key_target, key_actor = jax.random.split(key)
     y = target(controller, batch, key_target)
     controller = rescale(controller, y, batch.valid)

@@ -9,13 +9,13 @@ x_t = (o_t, r_{t-1}) and z_t = [z¹_t, z²_t]:
     decoders   p(o_t)  = N(μ, σ)[z_t],    p(r_{t-1}) = N(μ, σ)[z_{t-1}, a_{t-1}, z_t]
     ELBO               = Σ_t log p(o_t) + log p(r_{t-1}) - D_KL(q(z¹_t) ‖ p(z¹_t))
 
-Speed decides the form: the products of the first layers with what does not come out of the loop are taken before it,
-and prior and decoders run after it. The loop and its gradient are those of `recurrence`.
+The code is arranged for speed: the products of the first layers with inputs from outside the loop are computed before
+the loop, and prior and decoders run after it. The loop and its gradient are those of `recurrence`.
 
-Departures: perceptrons for convolutions, tanh, and a learned σ of the decoders, as Han et al. have it; μ and σ are two
-outputs of one perceptron, as Lee et al. have it (Han et al. have a perceptron for each, at twice the cost); and an
-episode's first timestep uses the same networks, with an input that marks it and zeros for z²_{t-1} and a_{t-1}, where
-both papers have further networks.
+Departures: MLPs in place of convolutions, tanh activations, and a learned σ of the decoders, as in Han et al. μ and σ
+are two outputs of one perceptron, as in Lee et al. (Han et al. have a perceptron for each, at twice the cost). The
+first timestep of an episode uses the same networks, with an input that marks it and zeros for z²_{t-1} and a_{t-1}.
+Both papers have further networks there.
 """
 
 import itertools
@@ -45,17 +45,17 @@ class GaussianMLP(eqx.Module):
         self.least = least
 
     def __call__(self, *inputs: Float[Array, "*batch _"]) -> Gaussian:
-        """The Gaussian for inputs given in parts, each (*batch, size)."""
+        """The Gaussian for inputs in several parts, each (*batch, size)."""
         first, *later = self.weights()
         (mean, sigma), _ = _layers(_linear(first, jnp.concatenate(inputs, axis=-1)), later)
         return Gaussian(mean, sigma + self.least)
 
     def weights(self) -> tuple[tuple[Float[Array, "input output"], Float[Array, " output"]], ...]:
-        """The weight, input by output, and the bias of each layer."""
+        """The weight (input, output) and the bias of each layer."""
         return tuple((layer.weight.T, layer.bias) for layer in self.mlp.layers)
 
     def columns(self, *sizes: int) -> list[Float[Array, "_ hidden"]]:
-        """The first layer's weights taken apart by the inputs' sizes, input by output."""
+        """The first layer's weights (input, output), split into parts for inputs of these sizes."""
         return jnp.split(self.mlp.layers[0].weight.T, list(itertools.accumulate(sizes))[:-1])
 
 
@@ -93,7 +93,7 @@ class LatentModel(eqx.Module):
         is_first: Bool[Array, "time batch"],
         noise: tuple[Float[Array, "time batch z1"], Float[Array, "time batch z2"]],
     ) -> Latents:
-        """The latent variables of windows; they begin anew wherever is_first, where prev_action must be 0."""
+        """The latent variables of windows. They are reset where is_first is set; prev_action must be 0 there."""
         known = jnp.concatenate([is_first[..., None].astype(x.dtype), prev_action], axis=-1)
         z1, z2 = (part.shape[-1] for part in noise)
         w_x, w_z2 = self.posterior.columns(x.shape[-1] + known.shape[-1], z2)
@@ -114,8 +114,8 @@ def predict(
 ) -> Gaussian:
     """p(x_t | z_{t-1}, a_{t-1}, z_t) along one episode from its first timestep on, leaves (time, x).
 
-    Where x_t is `observed`, z¹_t is drawn from the posterior: open loop. Where it is not, z¹_t is drawn from the prior:
-    closed loop. The first timestep has no reward: its entries are NaN.
+    Where x_t is `observed` (open loop), z¹_t is drawn from the posterior. Elsewhere (closed loop) it is drawn from the
+    prior. The first timestep has no reward: its entries are NaN.
     """
     is_first = jnp.arange(len(observed)) == 0
 
@@ -138,7 +138,7 @@ def predict(
 
 
 class LoopWeights(NamedTuple):
-    """The weights that stay inside the loop, each (input, output); with biases those of the later layers."""
+    """The weights inside the loop, each (input, output); the later layers also have biases."""
 
     w_z2: Float[Array, "z2 hidden"]  # of the posterior's first layer
     w_z1: Float[Array, "z1 hidden"]  # of the first layer of z²'s network
@@ -197,7 +197,7 @@ def _backward(weights, memory, grad_z2, grad_output):
 
 
 def _factors(memory, grads):
-    """The gradient of what was given; what each weight in the loop multiplied; the gradient of the product."""
+    """The gradient of `given`; the factor of each weight in the loop; the gradient of each product."""
     (inputs1, inputs2, _), before = memory.saved, memory.output.before
     (first1, *later1), (first2, *later2) = grads
     inputs = LoopWeights(before, memory.output.z1, before, _twice(inputs1), _twice(inputs2))
@@ -205,7 +205,7 @@ def _factors(memory, grads):
 
 
 def _twice(leaves: Sequence[Array]) -> tuple[tuple[Array, Array], ...]:
-    """Each for a layer's weight and for its bias."""
+    """Each leaf twice: for the weight and for the bias of a layer."""
     return tuple((leaf, leaf) for leaf in leaves)
 
 
@@ -228,7 +228,7 @@ def elbo_terms(
     prev_action: Float[Array, "time batch action"],
     is_first: Bool[Array, "time batch"],
 ) -> LatentElboTerms:
-    """The terms of the ELBO of windows whose latent variables were inferred."""
+    """The terms of the ELBO of windows, given their inferred latent variables."""
     first = is_first[..., None]
     prior = model.prior(latents.before, prev_action)
     prior = Gaussian(jnp.where(first, 0.0, prior.mean), jnp.where(first, 1.0, prior.sigma))

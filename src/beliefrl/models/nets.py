@@ -1,7 +1,8 @@
-"""Building blocks of every network here: perceptrons, the LSTM's gates, Gaussians plain and squashed by tanh.
+"""Building blocks of all networks: perceptrons, the gates of the LSTM, Gaussians with and without a tanh.
 
-All are written for one example and mapped over batches from outside. Layers start as PyTorch's do: weights and
-biases uniform in ±1/√fan_in, an LSTM's in ±1/√size. A new module holds these bounds; `draw` makes weights of them.
+All are written for one example, and the caller maps them over batches. The initialisation is PyTorch's: weights and
+biases are uniform in ±1/√fan_in, those of an LSTM in ±1/√size. A new module contains these bounds; `draw` replaces them
+by random weights.
 """
 
 import itertools
@@ -29,7 +30,7 @@ Params = TypeVar("Params")
 
 
 class Linear(eqx.Module):
-    """y = W x + b. Equinox's own would draw its weights here; see `draw`."""
+    """y = W x + b. Equinox's class would draw its weights here; see `draw`."""
 
     weight: Float[Array, "output input"]
     bias: Float[Array, " output"]
@@ -57,7 +58,7 @@ class MLP(eqx.Module):
         return self.rest(self.layers[0](x))
 
     def rest(self, first: Float[Array, " hidden"]) -> Float[Array, " output"]:
-        """The output, given the first layer's: for callers that compute the first product elsewhere."""
+        """The network's output, given the output of its first layer, for callers that compute the first product."""
         for layer in self.layers[1:]:
             first = layer(self.activation(first))
         return first
@@ -66,7 +67,7 @@ class MLP(eqx.Module):
 def draw(key: Key[Array, ""], bounds: Params) -> Params:
     """Weights uniform in ±bound, for every number in a tree of bounds.
 
-    All weights come from one random draw: XLA compiles a draw for each shape, a quarter of a second each.
+    All weights come from one random draw, because XLA compiles a draw for each shape, in a quarter of a second.
     """
     leaves, structure = jax.tree.flatten(bounds)
     numbers = jax.random.uniform(key, (sum(leaf.size for leaf in leaves),), minval=-1.0)
@@ -90,12 +91,12 @@ class LSTMSlopes(NamedTuple):
 
 
 def lstm_step(gates: Float[Array, "*batch gates"], c: Float[Array, "*batch d"]) -> tuple[LSTMState, LSTMSlopes]:
-    """The next state from the gates' pre-activations i, f, g, o side by side, and its derivatives:
+    """The next state from the concatenated pre-activations of the gates i, f, g, o, and its derivatives:
 
     c' = σ(f) c + σ(i) tanh g,   d' = σ(o) tanh c'
 
-    One tanh serves all four, as σ(x) = ½ tanh(x/2) + ½: XLA vectorises it over the whole array, which it does not
-    do for four functions of slices (5 times slower).
+    One tanh computes all four gates, because σ(x) = ½ tanh(x/2) + ½. XLA vectorises it over the whole array. It does
+    not vectorise four functions of slices, which are 5 times slower.
     """
     size = c.shape[-1]
     is_g = (jnp.arange(4 * size) // size == 2).reshape((1,) * (gates.ndim - 1) + (-1,))
@@ -111,13 +112,13 @@ def lstm_step(gates: Float[Array, "*batch gates"], c: Float[Array, "*batch d"]) 
 def lstm_step_backward(
     slopes: LSTMSlopes, grad: LSTMState
 ) -> tuple[Float[Array, "*batch gates"], Float[Array, "*batch d"]]:
-    """The gradients of the gates and of c, given that of the next state."""
+    """The gradients of the gates and of c, given the gradient of the next state."""
     grad_c = grad.c + grad.d * slopes.d
     return jnp.concatenate([grad_c, grad_c, grad_c, grad.d], axis=-1) * slopes.gates, grad_c * slopes.c
 
 
 class LSTM(eqx.Module):
-    """An LSTM over time. Its weights are stored input by output, as the loop multiplies them; gates i, f, g, o."""
+    """An LSTM over time. Its weights are stored as (input, output), as the loop needs them; gates i, f, g, o."""
 
     w_x: Float[Array, "input 4*d"]
     w_d: Float[Array, "d 4*d"]
@@ -129,14 +130,14 @@ class LSTM(eqx.Module):
         self.bias = jnp.full((4 * d,), d**-0.5)
 
     def start(self, batch: int) -> LSTMState:
-        """The state in which episodes begin."""
+        """The state at the start of an episode."""
         zeros = jnp.zeros((batch, self.w_d.shape[0]))
         return LSTMState(zeros, zeros)
 
     def unroll(
         self, start: LSTMState, x: Float[Array, "time batch input"], is_first: Bool[Array, "time batch"]
     ) -> LSTMState:
-        """The states at every step, from `start` and from zero wherever is_first; leaves (time, batch, d)."""
+        """The states at every step, starting from `start`, and from zero where is_first; leaves (time, batch, d)."""
         given = x @ self.w_x
         given = given + jnp.broadcast_to(self.bias, given.shape)
         return unroll(LSTM_CELL, self.w_d, start, given, is_first, None)
@@ -181,7 +182,7 @@ def gaussian_kl(
 ) -> Float[Array, "*shape"]:
     """D_KL(q ‖ p) of two Gaussians, entry by entry: log σ_p/σ_q + ((μ_q - μ_p)² + σ_q²) / 2σ_p² - ½.
 
-    The paper prints the logarithm's argument upside down; this is the divergence, which is never negative.
+    In the paper the argument of the logarithm is inverted. This is the divergence, which is never negative.
     """
     return jnp.log(sigma_p / sigma_q) + ((mean_q - mean_p) ** 2 + sigma_q**2) / (2 * sigma_p**2) - 0.5
 
@@ -200,7 +201,7 @@ def descend(
     optimiser: optax.GradientTransformation, gradient: Params, state: optax.OptState, params: Params
 ) -> tuple[Params, optax.OptState]:
     """One step of an optimiser; returns the new parameters and its new state."""
-    tree: Any = params  # optax's types know only trees of its own making
+    tree: Any = params  # optax's types accept only its own trees
     updates, state = optimiser.update(gradient, state, tree)  # pyright: ignore[reportArgumentType]
     return optax.apply_updates(tree, updates), state  # pyright: ignore[reportReturnType]
 
@@ -213,20 +214,23 @@ class RunningStatistics(NamedTuple):
     batches: Float[Array, ""]  # batches so far
 
 
-STATISTICS_RATE = 1e-3  # least weight of a new batch, reached after 1 / rate batches
+STATISTICS_RATE = 1e-3  # smallest weight of a new batch, reached after 1 / rate batches
 DEVIATION_MIN = 1e-3  # added to deviations: entries that vary less than this stay small
 STANDARDISED_MAX = 10.0
 
 
 def initial_statistics(size: int) -> RunningStatistics:
-    """Before any batch: mean 0, variance 1."""
+    """The statistics before any batch: mean 0, variance 1."""
     return RunningStatistics(jnp.zeros(size), jnp.ones(size), jnp.zeros(()))
 
 
 def update_statistics(
     statistics: RunningStatistics, x: Float[Array, "*batch size"], valid: Bool[Array, "*batch"]
 ) -> RunningStatistics:
-    """Include the valid vectors of one more batch: an average over batches, exponential after 1 / STATISTICS_RATE."""
+    """Include the valid vectors of one more batch.
+
+    This is an average over batches, and an exponential average after 1 / STATISTICS_RATE batches.
+    """
     batches = statistics.batches + 1
     rate, flat, weight = jnp.maximum(1 / batches, STATISTICS_RATE), x.reshape(-1, x.shape[-1]), valid.ravel()
     weight = weight / jnp.maximum(jnp.sum(weight), 1)
@@ -236,7 +240,7 @@ def update_statistics(
 
 
 def standardise(statistics: RunningStatistics | None, x: Float[Array, "*batch size"]) -> Float[Array, "*batch size"]:
-    """x with mean 0 and deviation 1, entries in [-10, 10]; x itself where `statistics` is None."""
+    """x with mean 0 and standard deviation 1, clipped to [-10, 10]; x itself if `statistics` is None."""
     if statistics is None:
         return x
     mean, deviation = (

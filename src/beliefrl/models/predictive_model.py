@@ -6,10 +6,10 @@ With x_t = (o_t, a_{t-1}, r_{t-1}), observations and rewards in standardised uni
     prediction           = MLP[h_t, a_t]
     J_model              = E ‖prediction - (o_{t+1}, r_t)‖²,  mean over the entries
 
-To predict, h_t must contain what the history reveals about the hidden state. Some cells begin with a long memory: their
-forget gates' biases are log U(1, T), so that they forget over up to T steps (Tallec and Ollivier 2018, "chrono
-initialisation"). An LSTM that begins as usual forgets an event within some tens of steps and does not learn otherwise
-from predictions one step ahead.
+To predict, h_t must contain the information of the history about the hidden state. Some cells start with a long
+memory: the biases of their forget gates are log U(1, T), so that they forget over up to T steps (Tallec and Ollivier
+2018, "chrono initialisation"). An LSTM with the usual initialisation forgets an event within some tens of steps.
+Predictions one step ahead do not train it to remember longer.
 """
 
 import equinox as eqx
@@ -28,14 +28,14 @@ class PredictiveModel(eqx.Module):
     predictor: MLP
 
     def __init__(self, obs: int, action: int, d: int, hidden: int):
-        """Sizes of observations, actions, the LSTM's state and the predictor's hidden layer."""
+        """Sizes of observations, actions, the state of the LSTM, and the hidden layer of the predictor."""
         self.lstm = LSTM(obs + action + 1, d)
         self.predictor = MLP((d + action, hidden, obs + 1), jax.nn.relu)
 
     def unroll(
         self, x: Float[Array, "time batch x"], is_first: Bool[Array, "time batch"], burn_in: int
     ) -> Float[Array, "kept batch d"]:
-        """h_t from the end of the burn-in on, which begins with an empty state and takes no gradient."""
+        """h_t after the burn-in. The burn-in starts with an empty state and gets no gradient."""
         start = self.lstm.start(x.shape[1])
         if burn_in:
             burnt_in = jax.lax.stop_gradient(self.lstm).unroll(start, x[:burn_in], is_first[:burn_in])
@@ -56,7 +56,7 @@ class PredictiveModel(eqx.Module):
 def init_model(
     key: Key[Array, ""], obs: int, action: int, d: int, hidden: int, long_memories: float, longest_memory: int
 ) -> PredictiveModel:
-    """A new model; the fraction `long_memories` of its cells forgets over 1 to `longest_memory` steps."""
+    """A new model. A fraction `long_memories` of its cells forgets over 1 to `longest_memory` steps."""
     key_weights, key_memories = jax.random.split(key)
     model = draw(key_weights, PredictiveModel(obs, action, d, hidden))
     cells = round(long_memories * d)

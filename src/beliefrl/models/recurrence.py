@@ -1,9 +1,9 @@
-"""A recurrence over time whose gradient is cheap: what the LSTM, VRM and SLAC's latent variables have in common.
+"""A recurrence over time with a cheap gradient, used by the LSTM, VRM and SLAC's latent variables.
 
-A `Cell` is one step. It computes only what depends on the state before it; all other products are computed before the
-scan and are its input `given`. `unroll` repeats the step. Its gradient is written by hand: a scan backwards in time
-gives the gradient of every sum that a weight's product enters, and the gradient of each weight is then one product
-over (time, batch). Plain differentiation would add up whole matrices at every step.
+A `Cell` is one step. It computes only the products that depend on the previous state. All other products are computed
+before the scan and are its input `given`. `unroll` repeats the step. Its gradient is written by hand: a scan backwards
+in time computes the gradient of every product with a weight. The gradient of each weight is then one matrix product
+over (time, batch). Automatic differentiation would add a whole matrix at every step.
 """
 
 import functools
@@ -18,15 +18,15 @@ from jaxtyping import Array, Bool, Float
 class Cell(NamedTuple):
     """One step of a recurrence for a batch, as three functions. Each weight is a matrix (input, output) or a bias.
 
-    Biases inside the loop are weights and no part of `given`: read at every step from a repeated array, they made the
-    unroll of VRM a third slower on the CPU (20 windows of 129 steps).
+    Biases inside the loop are weights and not a part of `given`. When they were read at every step from a repeated
+    array, the unroll of VRM was a third slower on the CPU (20 windows of 129 steps).
 
-    forward(weights, before, given, noise) -> (state, output, saved): the next state, what `unroll` returns, and what
-        the other two functions need besides.
+    forward(weights, before, given, noise) -> (state, output, saved): the next state, the output of `unroll`, and the
+        further values that the other two functions need.
     backward(transposed, memory, grad_state, grad_output) -> (grad_before, grads): the gradient of one step, and the
-        gradients that `factors` needs of it; `transposed` are the weights (output, input).
-    factors(memory, grads) -> (grad_given, inputs, grad_products): for all steps, the gradient of `given`, what each
-        weight multiplied (for a bias, anything) and the gradient of the product. The last two are trees like the
+        gradients that `factors` needs; `transposed` are the weights (output, input).
+    factors(memory, grads) -> (grad_given, inputs, grad_products): for all steps, the gradient of `given`, the factor
+        of each weight (for a bias, any array) and the gradient of the product. The last two are trees like the
         weights, leaves (time, batch, ...).
     """
 
@@ -36,7 +36,7 @@ class Cell(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What the gradient needs of the way forward, of one step or of all."""
+    """Values of the forward pass that the gradient needs, of one step or of all."""
 
     output: Any
     saved: Any
@@ -45,7 +45,7 @@ class Memory(NamedTuple):
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
 def unroll(cell: Cell, weights: Any, start: Any, given: Any, is_first: Bool[Array, "time batch"], noise: Any) -> Any:
-    """The cell's outputs at every step, from `start` and from zero wherever is_first; leaves (time, batch, ...).
+    """The cell's outputs at every step, starting from `start`, and from zero where is_first; leaves (time, batch, ...).
 
     Differentiable in weights, start and given. Leaves of `start` are (batch, size), of `given` and `noise`
     (time, batch, size).
@@ -93,7 +93,7 @@ def _unroll_backward(cell, residuals, grad_output):
 def _weight_gradient(
     weight: Float[Array, "..."], inputs: Float[Array, "time batch _"], grad: Float[Array, "time batch output"]
 ) -> Float[Array, "..."]:
-    """The gradient of a weight, given that of its products."""
+    """The gradient of a weight, given the gradient of its products."""
     is_bias = weight.ndim == 1
     return jnp.sum(grad, (0, 1)) if is_bias else jnp.einsum("tbm,tbn->mn", inputs, grad)
 

@@ -1,12 +1,12 @@
-"""The transitions of windows as the controller learns from them: one step long (the paper), or n.
+"""The transitions from which the controller learns: over one step (the paper), or over n steps.
 
 With n steps the critics are trained towards
 
     r_t + γ r_{t+1} + ... + γ^{m-1} r_{t+m-1} + γ^m V̄(s_{t+m}),    m ≤ n
 
-where m is n, or as many steps as are left of the episode or the window. What V̄ has learned then reaches Q in n times
-fewer updates. The actions on the way are those that were taken, by policies of old, and their entropy is not counted:
-the target is biased, and the more so the larger n is.
+where m is n, or the number of steps that are left of the episode or the window. Information in V̄ then reaches Q in n
+times fewer updates. The actions in between were chosen by older policies, and their entropy is not counted. So the
+target is biased. The bias grows with n.
 """
 
 from typing import NamedTuple
@@ -19,7 +19,7 @@ from beliefrl.types import Timestep
 
 
 class Returns(NamedTuple):
-    """What the transitions that begin at each timestep of windows (time-major) lead to."""
+    """Results of the transitions that start at each timestep of windows (time-major)."""
 
     end: Int[Array, "length batch"]  # index of s_{t+m} among the windows' timesteps
     reward: Float[Array, "length batch"]  # discounted sum of the m rewards
@@ -28,9 +28,9 @@ class Returns(NamedTuple):
 
 
 def n_step_returns(step: Timestep, valid: Bool[Array, "length batch"], n: int, gamma: float) -> Returns:
-    """The returns of `length` transitions, given the length + 1 timesteps between which they lie.
+    """The returns of `length` transitions between length + 1 timesteps.
 
-    `valid` says which neighbours are transitions; of those that are not, what is returned means nothing.
+    `valid` marks the pairs of neighbours that are transitions. For other pairs the returned values have no meaning.
     """
     length = valid.shape[0]
     first = jnp.broadcast_to(jnp.arange(length)[:, None], valid.shape)
@@ -47,7 +47,7 @@ def n_step_returns(step: Timestep, valid: Bool[Array, "length batch"], n: int, g
 
 
 def _shifted(leaf: Array, ahead: int) -> Array:
-    """What lies `ahead` steps later; zero (or False) where the window has ended."""
+    """The values `ahead` steps later; zero (or False) where the window has ended."""
     return jnp.concatenate([leaf[ahead:], jnp.zeros_like(leaf[:ahead])])
 
 
@@ -62,7 +62,7 @@ def transition_batch(
 ) -> Batch:
     """The transitions between length + 1 timesteps of windows (time-major), leaves (length, batch, ...).
 
-    `next_belief` holds the inputs of V̄ at the same timesteps; `actor_input` the actor's where not `belief`.
+    `next_belief` has the inputs of V̄ at the same timesteps. `actor_input` has those of the actor, if not `belief`.
     """
     returns = n_step_returns(step, valid, n, gamma)
     after = next_belief[1:] if n == 1 else jnp.take_along_axis(next_belief, returns.end[..., None], axis=0)

@@ -1,15 +1,15 @@
-"""Soft actor-critic on a belief: two Q networks, V, its slowly moving target, and a learned temperature.
+"""Soft actor-critic on a belief: two Q networks, V, its target network, and a learned temperature.
 
-Source: Section 3.3 of the paper (after Haarnoja et al. 2018, 2019), with s the belief:
+Source: Section 3.3 of the paper (after Haarnoja et al. 2018, 2019), where s is the belief:
 
     J_V = E ½ (V(s) - (min_i Q_i(s, ã) - α log π(ã|s)))²
     J_Q = E ½ (Q_i(s, a) - (r + γ (1 - terminated) V̄(s')))²,  summed over i
     J_π = E α log π(ã|s) - min_i Q_i(s, ã)  +  regulariser · ½ E (μ² + σ²)
     J_α = E -log α (log π(ã|s) + H_target)
 
-ã is one sample, used wherever an action is sampled. Departures, both from the authors' code: the regulariser, and
-log α in place of α in J_α, which is the same descent at another speed. A time limit is no termination. In each loss
-the differentiated argument comes first, and means are over valid transitions.
+ã is one sample, used in all losses that need a sampled action. Departures, both from the authors' code: the actor is
+regularised, and J_α is written in log α and not in α. The gradient has the same sign. A time limit is not a
+termination. In each loss the differentiated argument comes first, and means are over valid transitions.
 """
 
 from typing import Any, NamedTuple, TypeVar
@@ -46,7 +46,7 @@ class Actor(eqx.Module):
 def q_value(
     critic: MLP, belief: Float[Array, "batch belief"], action: Float[Array, "batch action"]
 ) -> Float[Array, " batch"]:
-    """Q(s, a). The first layer is taken apart so that one W_s s serves Q(s, a) and Q(s, ã)."""
+    """Q(s, a). The first layer is split, so that one product W_s s serves Q(s, a) and Q(s, ã)."""
     first, size = critic.layers[0], belief.shape[-1]
     projected = belief @ first.weight[:, :size].T
     return jax.vmap(lambda s, a: critic.rest(s + first.weight[:, size:] @ a + first.bias)[0])(projected, action)
@@ -87,7 +87,7 @@ class Batch(NamedTuple):
     terminated: Bool[Array, " batch"]  # `next_belief` is terminal
     discount: Float[Array, " batch"]  # γ^m of the value at `next_belief`
     valid: Bool[Array, " batch"]  # mask: False entries are ignored
-    actor_input: Float[Array, "batch actor_input"] | None = None  # the actor's input where that is not s_t (SLAC)
+    actor_input: Float[Array, "batch actor_input"] | None = None  # the actor's input if it is not s_t (SLAC)
 
 
 def init_controller(
@@ -101,7 +101,7 @@ def init_controller(
 ) -> Controller:
     """A new controller for beliefs and actions of these sizes; V̄ starts as V, log α at 0.
 
-    `actor_size` is the size of the actor's input where that is not the belief; `value_start` is added to V and Q.
+    `actor_size` is the size of the actor's input if it is not the belief; `value_start` is added to V and Q.
     """
     actor = Actor(belief if actor_size is None else actor_size, action, policy_layers)
     critic = MLP((belief + action, *value_layers, 1), jax.nn.relu)
@@ -142,7 +142,7 @@ def squared_errors(critics: tuple[MLP, MLP], batch: Batch, target: Float[Array, 
 def actor_loss(
     actor: Actor, controller: Controller, batch: Batch, noise: Float[Array, "batch action"], regulariser: float
 ) -> tuple[Float[Array, ""], tuple[Float[Array, " batch"], Float[Array, " batch"]]]:
-    """J_π; beside it min_i Q_i(s, ã) and log π(ã|s). No gradient flows into the belief through Q."""
+    """J_π; also returns min_i Q_i(s, ã) and log π(ã|s). No gradient reaches the belief through Q."""
     mean, log_sigma = jax.vmap(actor)(batch.belief if batch.actor_input is None else batch.actor_input)
     action, log_prob = jax.vmap(tanh_gaussian)(mean, log_sigma, noise)
     q = controller.q(jax.lax.stop_gradient(batch.belief), action)
@@ -159,7 +159,7 @@ def alpha_loss(
 
 
 def wanted_entropy(batch: Batch, given: float | None) -> float:
-    """H_target: minus the degrees of freedom of the action, if no other is given."""
+    """H_target: `given`, or minus the number of action dimensions."""
     return -float(batch.action.shape[-1]) if given is None else given
 
 
@@ -170,11 +170,11 @@ def loss(
     regulariser: float,
     target_entropy: float | None = None,
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-    """J_π + J_V + J_Q + J_α, with stop_gradient on all that a loss does not train; and what to log.
+    """J_π + J_V + J_Q + J_α, with stop_gradient on everything that a loss does not train; and the metrics.
 
-    So its gradient is that of the four losses at the same parameters (V̄'s is zero), and where the beliefs are formed
-    by a network that learns as well (`sac-lstm`), the gradient of J_π, J_V and J_Q in it. `noise` is standard normal,
-    one vector a transition: the sample ã. `target_entropy` None is -DOF.
+    So its gradient is that of the four losses at the same parameters (that of V̄ is zero). If a learning network forms
+    the beliefs (`sac-lstm`), this network gets the gradient of J_π, J_V and J_Q. `noise` is standard normal, one vector
+    per transition, for the sample ã. `target_entropy` None is minus the number of action dimensions.
     """
     fixed = jax.lax.stop_gradient(controller)
     j_pi, extras = actor_loss(controller.actor, fixed, batch, noise, regulariser)
@@ -195,7 +195,7 @@ def loss(
 
 
 def soft_update(target: Network, value: Network, tau: float) -> Network:
-    """Move a target network, such as V̄, by the fraction τ towards the one that is trained."""
+    """Move a target network, such as V̄, by the fraction τ towards the trained network."""
     return jax.tree.map(lambda old, new: old + tau * (new - old), target, value)
 
 
@@ -225,7 +225,7 @@ def init_optimisers(optimisers: Optimisers, controller: Controller) -> Optimiser
 def update(
     optimisers: Optimisers, state: OptimiserState, controller: Controller, gradient: Controller, tau: float
 ) -> tuple[Controller, OptimiserState]:
-    """One step of every optimiser, then of V̄ towards the new V."""
+    """One step of every optimiser, then a soft update of V̄."""
     actor, s_actor = descend(optimisers.actor, gradient.actor, state.actor, controller.actor)
     (critics, value), s_critic = descend(
         optimisers.critic, (gradient.critics, gradient.value), state.critic, (controller.critics, controller.value)

@@ -1,6 +1,6 @@
-"""The variational recurrent model (VRM): learns to predict perceptions, and so forms a recurrent state d.
+"""The variational recurrent model (VRM): it learns to predict its inputs, and forms a recurrent state d.
 
-Source: Section 4.1, Appendix A.1. With x_t = (o_t, r_{t-1}), a_{t-1} the action before it, and [..] concatenation:
+Source: Section 4.1, Appendix A.1. x_t = (o_t, r_{t-1}), a_{t-1} is the action before it, and [..] is a concatenation:
 
     prior      p(z_t)  = N(μ_p, σ_p)[d_{t-1}, a_{t-1}]
     posterior  q(z_t)  = N(μ_q, σ_q)[d_{t-1}, a_{t-1}, f_x(x_t)]
@@ -8,11 +8,11 @@ Source: Section 4.1, Appendix A.1. With x_t = (o_t, r_{t-1}), a_{t-1} the action
     state      d_t     = LSTM(d_{t-1}; [f_x(x_t), z_t])
     ELBO               = E_q log p(x_t) - D_KL(q(z_t) ‖ p(z_t))
 
-Speed decides the form. The posterior's first layers and the LSTM's gates are one layer, `Joint`, kept apart by what it
-multiplies: its products with f_x(x) and a are one batched product before the loop, prior and decoder run after it,
-and the loop keeps the products with d and z. The loop and its gradient are those of `recurrence`.
+The code is arranged for speed. The posterior's first layers and the LSTM's gates are one layer, `Joint`, with separate
+weights for each input. Its products with f_x(x) and a are one batched product before the loop. The products with d and
+z are computed in the loop. Prior and decoder run after it. The loop and its gradient are those of `recurrence`.
 
-Departure: one bias for each gate, where PyTorch's LSTM adds up two.
+Departure: a gate has one bias. In PyTorch's LSTM it is the sum of two.
 """
 
 from typing import NamedTuple
@@ -47,15 +47,15 @@ class Inferred(NamedTuple):
 
 
 class Joint(eqx.Module):
-    """The first layers of μ_q and σ_q and the four gates, side by side: (hidden, hidden, 4 d) = joint outputs.
+    """The first layers of μ_q and σ_q and the four gates, concatenated: (hidden, hidden, 4 d) = joint outputs.
 
-    Stored input by output, as the loop multiplies them; what an output does not read has no weights here.
+    Weights are stored as (input, output), as the loop needs them. An output has weights only for its own inputs.
     """
 
     w_d: Float[Array, "d joint"]
     w_features: Float[Array, "hidden joint"]
-    w_action: Float[Array, "action 2*hidden"]  # the posterior alone
-    w_z: Float[Array, "z 4*d"]  # the gates alone
+    w_action: Float[Array, "action 2*hidden"]  # of the posterior only
+    w_z: Float[Array, "z 4*d"]  # of the gates only
     bias: Float[Array, " joint"]
 
     def __init__(self, action: int, d: int, z: int, hidden: int):
@@ -70,9 +70,9 @@ class Joint(eqx.Module):
         self,
         features: Float[Array, "time batch hidden"],
         prev_action: Float[Array, "time batch action"],
-        posterior_reads_x: bool = True,
+        posterior_reads_x: bool,
     ) -> Float[Array, "time batch joint"]:
-        """What the layer gets from f_x(x_t) and a_{t-1}; without f_x(x_t) for the posterior unless it sees it."""
+        """What the layer gets from f_x(x_t) and a_{t-1}; without f_x(x_t) for the posterior unless it reads x_t."""
         posterior = prev_action @ self.w_action
         gates = jnp.zeros((*posterior.shape[:-1], self.w_z.shape[1]))
         w_features = self.w_features
@@ -98,8 +98,8 @@ class VRM(eqx.Module):
     def __init__(self, x: int, action: int, d: int, z: int, hidden: int, deterministic: bool = False):
         """Widths: perception (observation and reward), action, d, z, and every hidden layer.
 
-        In a `deterministic` model posterior and prior are one, z_t = μ_q[d_{t-1}, a_{t-1}] (Appendix C); it does
-        not use its networks of the prior and of any σ.
+        In a `deterministic` model posterior and prior are the same, z_t = μ_q[d_{t-1}, a_{t-1}] (Appendix C). It does
+        not use its networks for the prior and for σ.
         """
 
         def net(*sizes: int) -> MLP:
@@ -113,7 +113,7 @@ class VRM(eqx.Module):
         self.deterministic = deterministic
 
     def start(self, batch: int) -> LSTMState:
-        """The state in which episodes begin."""
+        """The state at the start of an episode."""
         zeros = jnp.zeros((batch, self.joint.w_d.shape[0]))
         return LSTMState(zeros, zeros)
 
@@ -135,7 +135,7 @@ class VRM(eqx.Module):
         is_first: Bool[Array, "time batch"],
         noise: Float[Array, "time batch z"],
     ) -> Inferred:
-        """Unroll the inference model with z_t = μ_q + σ_q · noise_t, from `start` and from zero wherever is_first."""
+        """Unroll the inference model with z_t = μ_q + σ_q · noise_t, from `start`, and from zero where is_first."""
         given = self.joint.given(jax.vmap(jax.vmap(self.features))(x), prev_action, not self.deterministic)
         noise = jnp.zeros_like(noise) if self.deterministic else noise
         mean, sigma = self.posterior_mean, self.posterior_sigma
@@ -158,15 +158,15 @@ def predict(
 ) -> Gaussian:
     """p(x_t | z_t, d_{t-1}) along one episode from its first timestep on, leaves (time, x).
 
-    Where x_t is `observed`, z_t is drawn from the posterior: open loop. Elsewhere z_t is drawn from the prior, and the
-    LSTM reads a draw of x_t from the decoder: closed loop. A deterministic model has σ = 0.
+    Where x_t is `observed` (open loop), z_t is drawn from the posterior. Elsewhere (closed loop) z_t is drawn from the
+    prior, and the LSTM reads a sample of x_t from the decoder. A deterministic model has σ = 0.
     """
 
     def step(state: LSTMState, inputs: tuple) -> tuple[LSTMState, Gaussian]:
         x, prev_action, observed, (noise_z, noise_x) = inputs
         timestep = jax.tree.map(lambda leaf: leaf[None, None], (x, prev_action, jnp.array(False), noise_z))
         z = vrm.infer(jax.tree.map(lambda leaf: leaf[None], state), *timestep).z[0, 0]
-        if not vrm.deterministic:  # there posterior and prior are one
+        if not vrm.deterministic:  # in deterministic models posterior and prior are the same
             prior = vrm.prior(state.d, prev_action)
             z = jnp.where(observed, z, prior.mean + prior.sigma * noise_z)
         mean, sigma = vrm.decode(state.d, z)
@@ -194,8 +194,8 @@ def elbo_terms(
 ) -> VRMElboTerms:
     """Both terms of the ELBO of an unroll.
 
-    `scaling` "mean" averages over the dimensions of z and x as the authors' code does (their learning rate was tuned
-    on it), "sum" is the paper's formula. With `prior_noise` z is drawn from the prior for decoding, as in their code.
+    `scaling` "mean" averages over the dimensions of z and x, as in the authors' code (their learning rate was tuned
+    with it). "sum" is the paper's formula. With `prior_noise`, x is decoded from a z of the prior, as in their code.
     """
     prior = jax.vmap(jax.vmap(vrm.prior))(inferred.before, prev_action)
     z = inferred.z if prior_noise is None else prior.mean + prior.sigma * prior_noise
@@ -212,7 +212,7 @@ def prediction_error(vrm: VRM, inferred: Inferred, x: Float[Array, "time batch x
 
 
 class LoopWeights(NamedTuple):
-    """The weights that stay inside the loop: (input, output), and the biases of the posterior's last layers."""
+    """The weights inside the loop, each (input, output), and the biases of the posterior's last layers."""
 
     w_d: Float[Array, "d joint"]
     w_z: Float[Array, "z 4*d"]
@@ -223,7 +223,7 @@ class LoopWeights(NamedTuple):
 
 
 def _forward(weights, before, given, noise):
-    """One step: prepares the posterior's hidden layers and the gates, draws z, and moves the LSTM."""
+    """One step: computes the posterior's hidden layers and the gates, draws z, and computes the LSTM's next state."""
     hidden = weights.mean.shape[0]
     joint = given + before.d @ weights.w_d
     first = jnp.tanh(joint[:, : 2 * hidden])
@@ -250,7 +250,7 @@ def _backward(weights, memory, grad_state, grad_output):
 
 
 def _factors(memory, grads):
-    """The gradient of what was given; what each weight in the loop multiplied; the gradient of the product."""
+    """The gradient of `given`; the factor of each weight in the loop; the gradient of each product."""
     grad_joint, grad_mean, grad_sigma = grads
     hidden_mean, hidden_sigma = jnp.split(memory.saved[0], 2, axis=-1)
     before, z = memory.output.before, memory.output.z

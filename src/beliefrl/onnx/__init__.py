@@ -28,7 +28,7 @@ def export(policy: Any, environment: Callable[[], Any] | None = None) -> tuple[b
 
     They are compared in onnxruntime at every timestep of an episode of at most 200 steps: each action, and each number
     of the next state, relative to its size if that is more than 1. The episode is played in an environment that
-    `environment` makes. If it is None, observations and rewards are made up.
+    `environment` makes. If it is None, observations and rewards are random.
 
     Raises:
         UserError: a package is missing, the agent uses a primitive that is not supported, or the difference is more

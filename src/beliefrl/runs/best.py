@@ -1,4 +1,4 @@
-"""The best agent of each seed: a file beside that of the last ones, with the evaluations in which they were the best.
+"""The best agent of each seed, in a file with the evaluations in which they were the best.
 
 The file has the agents only, without optimisers and replay. It is replaced atomically, and only when a seed improves.
 So resuming neither loses it nor replaces an agent by a worse one.
@@ -17,7 +17,7 @@ BEST = "best.safetensors"
 
 
 def evaluations(folder: pathlib.Path, seeds: int) -> list[dict[str, Any] | None]:
-    """{"step", "return"} of the best evaluation of each of a run's `seeds` seeds; None where there is none.
+    """{"step", "return"} of the best evaluation of each of a run's `seeds` seeds; None if there is none.
 
     The return is the mean over the episodes with sampled actions.
 

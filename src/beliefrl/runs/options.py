@@ -36,7 +36,7 @@ class Options:
     """Number of consecutive evaluations in which the returns must be at least stop_at."""
     init_from: str | None = None
     """Folder of a run whose trained agent gives the initial networks. It must have the same agent and sizes. A seed
-    starts from the seed of that number there, or in turn where there are fewer. None: random initial networks."""
+    starts from the same seed there. If that run has fewer seeds, they are reused in a cycle. None: random networks."""
     init_best: bool = False
     """Take the best agent of init_from instead of its last one."""
     replay_capacity: int = 1_000_000

@@ -76,5 +76,5 @@ class SweepDisplay:
 
 
 def _note(status: SweepStatus, name: str) -> str:
-    """What to add to a line about a training."""
+    """The text that is added to a line about a training."""
     return f": {status.notes[name]}" if name in status.notes else ""

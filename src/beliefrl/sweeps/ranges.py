@@ -1,4 +1,4 @@
-"""What `tune` tries: the ranges of an agent's hyperparameters, and how a trial draws its settings from them."""
+"""The search space of `tune`: the ranges of an agent's hyperparameters, and how a trial draws settings from them."""
 
 import json
 import re
@@ -23,7 +23,7 @@ class Drawing(Protocol):
 
 
 def from_text(name: str, text: str) -> Range | None:
-    """The Range that LOW..HIGH or LOW..HIGH:SCALE means; None if the text has no "..".
+    """The Range of a text LOW..HIGH or LOW..HIGH:SCALE; None if the text has no "..".
 
     Raises:
         UserError: an end is not a number, or there is no such scale.
@@ -140,7 +140,7 @@ def _rounded(number: float) -> float:
 
 
 def _parameter(name: str, values: Range | Sequence[Any]) -> str:
-    """The name of Optuna's parameter for a hyperparameter: with the scale horizon it is what 1 lacks."""
+    """The name of Optuna's parameter for a hyperparameter. With the scale horizon it stands for 1 - value."""
     return f"1-{name}" if isinstance(values, Range) and values.scale == "horizon" else name
 
 

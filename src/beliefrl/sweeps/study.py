@@ -1,4 +1,4 @@
-"""A study of `tune`: what is tuned, and Optuna's record of the trials, in one file.
+"""A study of `tune`: the search space, the objective, and Optuna's record of the trials, in one file.
 
 Optuna's journal is a file of JSON lines. Only the process that has locked the folder writes it.
 """
@@ -59,7 +59,7 @@ def name_of(number: int) -> str:
 
 
 class Search:
-    """What is tuned: the training with its fixed settings, the ranges, and the objective."""
+    """A search: the training with its fixed settings, the ranges, and the objective."""
 
     def __init__(
         self, experiment: Experiment, given: Ranges, only: Sequence[str], objective: Objective, actions: Actions
@@ -157,7 +157,7 @@ def open_study(folder: pathlib.Path, search: Search, prune: bool) -> Any:
 
 
 def _repair(path: pathlib.Path) -> None:
-    """Remove what a process that was killed while it wrote has left: a part of a line, and Optuna's lock."""
+    """Remove the remains of a process that was killed while it wrote: a part of a line, and Optuna's lock."""
     path.with_name(path.name + ".lock").unlink(missing_ok=True)
     if path.exists():
         content = path.read_bytes()
@@ -166,7 +166,7 @@ def _repair(path: pathlib.Path) -> None:
 
 
 def _check_same(folder: pathlib.Path, recorded: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
-    """Raise a UserError if a study was started with something else than is asked for now."""
+    """Raise a UserError if a study was started with other settings than those that are asked for now."""
     for name in [*asked, *recorded]:
         before, now = recorded.get(name), asked.get(name)
         if before != now:
@@ -175,7 +175,7 @@ def _check_same(folder: pathlib.Path, recorded: Mapping[str, Any], asked: Mappin
 
 
 def running(study: Any) -> list[tuple[Any, dict[str, Any]]]:
-    """The trials that were stopped, with their settings. They can be told and continued.
+    """The trials that were stopped, with their settings. They can be continued.
 
     A trial without settings was stopped before its training began. It counts as failed.
     """

@@ -27,9 +27,9 @@ class Task(Protocol):
     `rollout` truncates episodes at `spec.max_steps` and resets them. Two members are optional. A task that can be
     rendered has a method `draw(states)`, which returns the `drawing.Picture` of an episode's states so far. A task may
     have `entry_names`, a tuple with the name of each entry of its observation, followed by the unit in brackets, for
-    the labels in figures: ("cos θ", "sin θ", "θ̇ (rad/s)"). If `spec.measures` names numbers that are recorded of each
-    episode, such as "success" or a distance, a method `measures(state)` returns them by name; those at the last state
-    count.
+    the labels in figures: ("cos θ", "sin θ", "θ̇ (rad/s)"). If `spec.measures` names numbers that are recorded for each
+    episode, such as "success" or a distance, a method `measures(state)` returns them by name. Their values at the last
+    state are recorded.
     """
 
     @property
@@ -144,7 +144,7 @@ def knows(name: str) -> bool:
 
 
 def _declared(name: str) -> tuple[str, str] | None:
-    """The entry point, (name, module:Class), of a task that is not ours, or of whose -v or -p version this is."""
+    """The entry point, (name, module:Class), of a package's task with this name, or whose -v or -p version this is."""
     theirs = declared(GROUP, our_names())
     for each in (name, name[:-2] if name[-2:] in MASKS else name):
         if each in theirs:
@@ -153,7 +153,7 @@ def _declared(name: str) -> tuple[str, str] | None:
 
 
 def _declared_class(name: str, value: str) -> type:
-    """The class of an entry point, once it is sure to be one of tasks."""
+    """The class of an entry point, after a check that it is a task's."""
     kind = load_declared(GROUP, name, value)
     lacks = [each for each in vars(Task) if not each.startswith("_") and each not in dir(kind)]
     if lacks or not dataclasses.is_dataclass(kind):
@@ -233,7 +233,7 @@ def _built(name: str, kind: type, constants: dict[str, Any]) -> Any:
         return kind(**tuples(constants))
     except UserError:
         raise
-    except Exception as error:  # whatever a task of a stranger's may raise
+    except Exception as error:  # a task of a package may raise anything
         if name in TASKS:
             raise
         raise UserError(f"The task {name} cannot be made: {said(error)}.") from None
@@ -246,12 +246,12 @@ def _similar(name: str) -> str | None:
 
 
 def observed(name: str, task: Any, entries: Sequence[int | str] | int | str) -> Any:
-    """The task `name` with only these entries of its observation; they are given as `observe` of `make`."""
+    """The task `name` with only these entries of its observation, which have the form of `observe` in `make`."""
     return observe(task, _indices(name, task, entries))
 
 
 def _indices(name: str, task: Any, observe: Sequence[int | str] | int | str) -> tuple[int, ...]:
-    """The indices that `observe` means for a task."""
+    """The indices that `observe` selects for a task."""
     given = [observe] if isinstance(observe, str | int) else list(observe)
     if len(given) == 1 and given[0] in MASKS.values():
         known: Any = KNOWN.get(name.removeprefix(PREFIX), ROBOTS.get(name))

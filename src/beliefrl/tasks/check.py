@@ -1,4 +1,4 @@
-"""Look at a task before training: what it shows and wants, what the training will refuse, and what is suspicious."""
+"""Check a task before training: its observations, actions and rewards, the reasons to refuse it, and warnings."""
 
 import dataclasses
 import io
@@ -38,12 +38,12 @@ class Entry:
     seen_high: float = np.nan
     """Range in the random steps; NaN for actions."""
     position: int | None = None
-    """Index in what the agent observes; None if the agent does not observe it."""
+    """Index in the agent's observation; None if the agent does not observe it."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class TaskCheck:
-    """What `check` found; prints as tables."""
+    """The result of `check`; printed as tables."""
 
     task: str
     observation_space: str
@@ -61,9 +61,9 @@ class TaskCheck:
     """Episodes that ended in these steps."""
     steps_per_second: float = 0.0
     warnings: tuple[str, ...] = ()
-    """Sentences about what is suspicious; the training does not refuse it."""
+    """Sentences about suspicious properties; the training does not refuse the task for them."""
     refusals: tuple[str, ...] = ()
-    """Sentences about what the training refuses; empty if the task can be trained on."""
+    """Sentences that say why a training would refuse the task; empty if it would not."""
 
     def __repr__(self) -> str:
         """The tables and sentences as plain text."""
@@ -73,7 +73,7 @@ class TaskCheck:
         return "\n".join(line.rstrip() for line in page.getvalue().splitlines())
 
     def __rich__(self) -> Group:
-        """Everything but the refusals, in colour on a terminal."""
+        """Everything except the refusals, in colour on a terminal."""
         parts = [self._summary()]
         if self.entries:
             parts += [_table("observation", self.entries, seen=True), _table("action", self.actions, seen=False)]
@@ -98,7 +98,7 @@ class TaskCheck:
 def check(
     task: Any, observe: Sequence[int | str] | int | str | None = None, steps: int = 200, seed: int = 0, **constants: Any
 ) -> TaskCheck:
-    """Take random steps in a task, and report what it shows and wants, what training refuses, and what is suspicious.
+    """Take random steps in a task. Report its observations, actions and rewards, and why a training would refuse it.
 
         print(beliefrl.check("gym:Pendulum-v1", observe=[0, 1]))
 
@@ -106,7 +106,7 @@ def check(
 
     Args:
         task: the name of a task, as for `make_task`, or a task.
-        observe: entries that the agent shall observe, as for `make_task`; None: all, or those of the task.
+        observe: entries that the agent will observe, as for `make_task`; None: all, or those of the task.
         steps: number of random steps, at least 1.
         seed: random seed of the steps, at least 0.
         constants: as for `make_task`, if `task` is a name.
@@ -125,13 +125,13 @@ def check(
     seen = whole
     try:
         seen = whole if observe is None else tasks.observed(name, whole, observe)
-    except UserError as error:  # the tables are still made: they show which entries there are
+    except UserError as error:  # the tables are still made, to show the existing entries
         found = dataclasses.replace(found, refusals=(str(error),))
     return _played(found, seen, steps, seed)
 
 
 def _declared(task: Any) -> TaskCheck:
-    """What a task declares. If its spaces are not supported: the refusals, and no entries."""
+    """The declarations of a task. If its spaces are not supported: the refusals, and no entries."""
     if not isinstance(task, GymnasiumTask):
         base, spec = _unmasked(task), task.spec
         names = tasks.entry_names(base)
@@ -173,7 +173,7 @@ def _refusals(*checks: Callable[[], Any]) -> tuple[str, ...]:
 
 
 def _played(found: TaskCheck, task: Any, steps: int, seed: int) -> TaskCheck:
-    """The same, with what random steps show; `task` has the entries that the agent observes."""
+    """The same with the results of random steps; `task` has the entries that the agent observes."""
     on_host = isinstance(task, GymnasiumTask)
     refusals, observations, rewards, times, ends = list(found.refusals), [], [], [], []
     environment: Any = task.environment() if on_host else TaskEnvironment(_unmasked(task))
@@ -213,7 +213,7 @@ def _played(found: TaskCheck, task: Any, steps: int, seed: int) -> TaskCheck:
 
 
 def _with_values(entries: Sequence[Entry], values: Any, seen: Sequence[int]) -> tuple[Entry, ...]:
-    """The entries with the range of their finite values (time, entry), and their positions in what the agent sees."""
+    """The entries with the range of their finite values (time, entry), and their positions in its observation."""
     positions = {index: position for position, index in enumerate(seen)}
     rows = []
     for entry, column in zip(entries, values.T, strict=True):
@@ -287,7 +287,7 @@ def _range(low: float, high: float) -> str:
 
 
 def _table(title: str, entries: Sequence[Entry], seen: bool) -> Table:
-    """One row for each entry. `seen`: with the range in the random steps, and the index in what the agent observes."""
+    """One row for each entry. `seen`: with the range in the random steps, and the index in the agent's observation."""
     caption = f"and {len(entries) - MOST_ROWS} more entries" if len(entries) > MOST_ROWS else None
     table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
     for heading in ("index", "name", "declared", *(("seen", "agent's index") if seen else ())):

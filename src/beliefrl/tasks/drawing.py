@@ -122,7 +122,7 @@ class Viewer:
                 raise self._pygame.error("there is no display")  # SDL would draw where nobody sees it
             return display.set_mode((width, height))
         except self._pygame.error as error:
-            raise UserError(f"A window cannot be opened ({one_line(str(error))}): write a film instead.") from None
+            raise UserError(f"A window cannot be opened ({one_line(str(error))}): write a video instead.") from None
 
     @property
     def is_closed(self) -> bool:

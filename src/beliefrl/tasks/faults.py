@@ -3,7 +3,7 @@
 At each step, in this order:
 
     the action that is applied   the agent's action, or the one that was applied before (`sticky`)
-    the task's observation       that of `delay` steps ago, plus Gaussian noise, then zeros for what is lost
+    the task's observation       that of `delay` steps ago, plus Gaussian noise, then zeros for lost entries
 
 The equations are in `Faults`, for JAX and for numpy. `Faulty` applies them to JAX tasks, and
 `gymnasium.FaultyEnvironment` to Gymnasium environments.
@@ -50,7 +50,7 @@ class Faults:
     dropout: float = 0.0
     """Probability, at each step, that an entry of the observation is lost. The agent then observes a zero there."""
     delay: int = 0
-    """Number of steps by which the observation is late. At the start of an episode the first one repeats."""
+    """Number of steps by which the observation is late. At the start of an episode the first one is repeated."""
     sticky: float = 0.0
     """Probability, at each step, that the previous action is applied again in place of the new one. Before the first
     action it is zero, the middle of its range."""
@@ -119,9 +119,9 @@ class Faults:
         return xp.repeat(obs[None], self.delay, axis=0)
 
     def observe(self, xp: Any, waiting: Any, obs: Any, draws: Draws) -> tuple[Any, Any]:
-        """The measurements that still wait after this step, and the observation of the agent.
+        """The measurements that are still delayed after this step, and the observation of the agent.
 
-        `waiting` (delay, obs) are those before this step, and `obs` (obs,) is the true observation.
+        `waiting` (delay, obs) are the delayed measurements before this step, and `obs` (obs,) is the true observation.
         """
         waiting = xp.concatenate([waiting, obs[None]])
         seen = waiting[0] + xp.asarray(self.noise, obs.dtype) * draws.noise
@@ -144,7 +144,7 @@ class FaultyState(NamedTuple):
 
     task: Any
     waiting: Float[Array, "delay obs"]
-    action: Float[Array, " action"]  # that was applied last
+    action: Float[Array, " action"]  # the last one that was applied
 
 
 @dataclasses.dataclass(frozen=True)

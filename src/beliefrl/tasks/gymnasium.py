@@ -24,7 +24,7 @@ ENDLESS = 10_000  # steps after which an episode without a time limit is conside
 class Fault(UserError):
     """An environment misbehaved. The message names the environment, the seed and the step."""
 
-    seeds: Any = None  # of a training: what was learned until then (`host_loop`)
+    seeds: Any = None  # of a training: the seeds as trained until then (`host_loop`)
     step: int = 0
     stretch: Any = None
 
@@ -44,7 +44,7 @@ class GymnasiumTask:
     max_steps: int | None = None
     """Time limit in steps, which truncates episodes; None: the environment's own limit."""
     measures: tuple[str, ...] = ()
-    """Entries of the environment's info to log for each episode, as last reported; `is_success` is "success", too."""
+    """Entries of the environment's info whose last value in an episode is logged; `is_success` is "success", too."""
     faults: Faults = NONE
     """Missing and faulty sensors."""
 
@@ -81,7 +81,7 @@ class GymnasiumTask:
         return tuple(names[index] for index in environment.indices)
 
     def environment(self, seed: str = "") -> "Environment":
-        """Make one environment, as the agent sees it. `seed` identifies it in the messages of faults.
+        """Make one environment, as the agent sees it. `seed` identifies it in error messages.
 
         Raises:
             UserError: the environment cannot be made, its spaces are not supported, or the noise does not fit its
@@ -122,7 +122,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         if task.indices is not None:
             check_indices(task.indices, self._size)
         self.indices = np.arange(self._size) if task.indices is None else np.array(task.indices)
-        self.whole = np.full(self._size, np.nan)  # the newest observation with all of its entries, as it came
+        self.whole = np.full(self._size, np.nan)  # the newest observation with all of its entries, as returned
         self._lowest, self._highest = limits(self.inner_observation_space, self.indices)
         self.observation_space = spaces.Box(-np.inf, np.inf, (self.indices.size,), np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (self.inner_action_space.low.size,), np.float32)

@@ -1,4 +1,4 @@
-"""Sequential target reaching: visit red, green and blue in that order; nothing shows which is next (Section 5.3).
+"""Sequential target reaching: visit red, green and blue in that order. The next one is not shown (Section 5.3).
 
 A robot on two wheels moves in a square field. It perceives all three targets. When it reaches the next target of the
 order, it gets a reward in that step. It must remember which targets it has already reached.

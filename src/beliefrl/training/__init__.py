@@ -1,1 +1,1 @@
-"""From the first environment step to the last: replay, rollout, phases, both loops, evaluation, `train` itself."""
+"""The training: replay, rollout, phases, both loops, evaluation, and `train`."""

@@ -1,10 +1,10 @@
 """The cost of a step: milliseconds per environment step at any sizes, in parts, and the speed of the machine.
 
-The task is made up (noise as observations), so only its sizes count. `ms_per_step` is the training loop itself, with
-the pre-training spread over the 100,000 steps of the paper's scalability table. Each part named `alone` is timed in a
-program of its own, and together they can exceed the whole: there each call writes networks and optimisers to fresh
-memory, where the loop updates them in place, and each update is a call, where the loop has those of a cycle in one
-program. They show which parts are large, not shares of a step. Timings are medians.
+The task is synthetic: its observations are noise. `ms_per_step` is the time of the training loop, including the
+pre-training divided by the 100,000 steps of the paper's scalability table. Each part named `alone` is timed in a
+program of its own. The sum of the parts can exceed the whole, because there each call writes networks and optimisers
+to new memory, and each update is a call. The loop updates them in place, and makes all updates of a cycle in one
+program. So the parts show what is large, and not the shares of a step. Timings are medians.
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ from beliefrl.training import replay as ring
 from beliefrl.training.schedule import Options, capacity
 from beliefrl.types import Spec, UserError, check_range
 
-PAPER_STEPS = 100_000  # of the wall-clock times in the paper's scalability table
+PAPER_STEPS = 100_000  # steps of the wall-clock times in the paper's scalability table
 REPEATS = 9
 
 
@@ -52,7 +52,7 @@ class Noise:
 
 
 def median_seconds(call: Callable[[], Any], repeats: int = REPEATS) -> float:
-    """The median time of a call, once it has run; waits for its result."""
+    """The median time of a call after a first one; waits for the results."""
     jax.block_until_ready(call())
     times = []
     for _ in range(repeats):
@@ -70,7 +70,7 @@ def matmul_gflops(size: int = 2048) -> float:
 
 
 def parameters(tree: Any) -> int:
-    """How many numbers the arrays of a tree hold."""
+    """The number of numbers in the arrays of a tree."""
     return sum(leaf.size for leaf in jax.tree.leaves(tree))
 
 
@@ -105,22 +105,22 @@ def bench(agent: Agent, obs: int, actions: int, seeds: int = 1, started: float |
     """Time an agent's training with observations and actions of these sizes, `seeds` of them in one program.
 
     Args:
-        agent: its hyperparameters count.
+        agent: the agent with its hyperparameters.
         obs, actions: sizes of the task's observation and action.
-        seeds: all times are of a step of all seeds together.
+        seeds: all times are for a step of all seeds together.
         started: `time.time()` at which the program began, for `first_training_step_s`.
 
     Returns:
         ms_per_step; acting_alone_ms, controller_update_alone_ms and model_update_alone_ms (see the module's docstring);
         pretraining_ms; all of these per environment step. pretraining_ms_per_update; first_training_step_s (from the
-        program's start to the end of the first cycle of learning, exploration and pre-training cut to one stretch);
-        compile_s, its part that is compilation; matmul_gflops; gflop_per_step, of the updates' matrix products as they
-        are executed (`_flop`); share_of_peak, of gflop_per_step in the loop's time; parameters of one seed; obs,
-        actions, seeds.
+        program's start to the end of the first cycle of learning, with exploration and pre-training shortened to one
+        block); compile_s, its part for compilation; matmul_gflops; gflop_per_step, of the updates' matrix products that
+        are executed (`_flop`); share_of_peak, the rate of gflop_per_step in the loop divided by matmul_gflops;
+        parameters of one seed; obs, actions, seeds.
     """
     if not 1 <= seeds <= 2 * PAPER_STEPS:
         raise UserError(f"seeds={seeds} is impossible: it must be from 1 to {2 * PAPER_STEPS}.")
-    with jax.default_matmul_precision(Options.precision):  # as a training has it by default
+    with jax.default_matmul_precision(Options.precision):  # the default of a training
         return _bench(agent, obs, actions, seeds, time.time() if started is None else started)
 
 
@@ -157,12 +157,12 @@ def _bench(agent: Agent, obs: int, actions: int, seeds: int, started: float) -> 
 
 
 def _per(call: Callable[[int], float], count: int) -> float:
-    """Median seconds of one of `count` things that a call does; the first call is not counted."""
+    """Median seconds of a call divided by `count`; the first call is not counted."""
     return statistics.median([call(count) for _ in range(REPEATS + 1)][1:]) / count
 
 
 def _update_parts(agent: Agent, timed: _Timed) -> tuple[dict[str, float], float]:
-    """Seconds of an environment step's share of the updates, and the floating-point operations of both (`_flop`)."""
+    """The updates' seconds per environment step, and their floating-point operations (`_flop`)."""
     seeds = timed.seeds
 
     def sample(replay: ring.Replay, key: Key[Array, ""]):
@@ -174,14 +174,14 @@ def _update_parts(agent: Agent, timed: _Timed) -> tuple[dict[str, float], float]
     def mapped(function: Callable[..., Any]) -> Callable[..., Any]:
         return jax.jit(jax.vmap(function))
 
-    # Where only the state is asked for, XLA drops the beliefs, so the difference is what they cost.
+    # If only the state is an output, XLA removes the beliefs, so the difference is their cost.
     has_model = bool(jax.eval_shape(mapped(lambda *args: agent.begin_cycle(*args)[2]), *given))
     model = mapped(lambda *args: agent.begin_cycle(*args)[0])
     begin = mapped(lambda *args: agent.begin_cycle(*args)[:2])
     update = mapped(lambda *args: agent.update(*args)[0])
     state, batches = begin(*given)
     batch = jax.tree.map(lambda leaf: leaf[:, 0], batches)
-    updates = jax.tree.leaves(batches)[0].shape[1] / agent.cycle  # of an environment step
+    updates = jax.tree.leaves(batches)[0].shape[1] / agent.cycle  # per environment step
 
     s_begin = median_seconds(lambda: begin(*given))
     s_model = median_seconds(lambda: model(*given)) if has_model else 0.0
@@ -195,11 +195,11 @@ def _update_parts(agent: Agent, timed: _Timed) -> tuple[dict[str, float], float]
 
 
 def _flop(function: Callable[..., Any], *args: Any) -> float:
-    """Floating-point operations of the matrix products that are executed, those in loops as often as the loop runs.
+    """Floating-point operations of the matrix products that are executed; products in loops count for each iteration.
 
-    A product that is written twice with the same factors (as W_s s in Q(s, a) and Q(s, ã)) is executed once and counts
-    once. A product over an axis of length 1 is an outer product: XLA multiplies entry by entry there, and that counts
-    as little as all else that is done entry by entry (1.4 % of the operations of VRM's controller update).
+    A product that is written twice with the same factors (as W_s s in Q(s, a) and Q(s, ã)) is executed once and counted
+    once. A product over an axis of length 1 is an outer product, which XLA computes entry by entry. Like all other
+    operations on single entries, it is not counted (1.4 % of the operations of VRM's controller update).
     """
 
     def count(jaxpr: Any) -> float:

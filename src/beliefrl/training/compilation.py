@@ -1,7 +1,7 @@
-"""Where compiled programs are kept, so that the second start of a training does not compile again.
+"""The cache of compiled programs, so that the second start of a training does not compile again.
 
-JAX's compilation cache does the work; this file says in which folder, and how large it may grow. Nothing happens on
-import. A setting of the user's own, JAX_COMPILATION_CACHE_DIR or `jax.config`, wins.
+This is JAX's compilation cache. This file defines its folder and its maximum size. Nothing happens on import. The
+user's own setting, JAX_COMPILATION_CACHE_DIR or `jax.config`, has priority.
 """
 
 import os
@@ -18,14 +18,14 @@ import jax
 
 VARIABLE = "BELIEFRL_CACHE"  # `off`, or a folder
 LARGEST_BYTES = 2**30
-SHORTEST_SECONDS = 0.1  # what compiles faster is not kept
+SHORTEST_SECONDS = 0.1  # programs that compile faster are not stored
 LOCK_SECONDS = 10.0
 
 
 def keep_compiled(note: Callable[[str], None] = warnings.warn) -> None:
-    """Let JAX keep what it compiles from now on, in `cache_folder()`.
+    """From now on, let JAX store compiled programs in `cache_folder()`.
 
-    A folder that cannot be written is no error: `note` is given a sentence, and everything is compiled anew.
+    If the folder cannot be written, `note` is called with a sentence, and everything is compiled without the cache.
     """
     settings: Any = jax.config  # its options are made at import, unknown to pyright
     if settings.jax_compilation_cache_dir or os.environ.get(VARIABLE, "").lower() == "off":
@@ -49,7 +49,7 @@ def keep_compiled(note: Callable[[str], None] = warnings.warn) -> None:
 
 
 def cache_folder() -> pathlib.Path:
-    """The folder of this machine: another one may not be able to run what this one compiles.
+    """The folder of this machine: another machine may not be able to run its programs.
 
     Raises:
         RuntimeError: the user has no home folder.
@@ -59,7 +59,7 @@ def cache_folder() -> pathlib.Path:
 
 
 def _user_folder() -> pathlib.Path:
-    """Where this platform keeps a user's caches."""
+    """The folder of this platform for a user's caches."""
     if sys.platform == "win32":
         return pathlib.Path(os.environ.get("LOCALAPPDATA") or pathlib.Path.home() / "AppData" / "Local")
     if sys.platform == "darwin":
@@ -68,7 +68,7 @@ def _user_folder() -> pathlib.Path:
 
 
 def _remove_unfinished(folder: pathlib.Path) -> None:
-    """Remove entries whose writing was cut off. JAX writes a time beside each at the end, and fails without one."""
+    """Remove incomplete entries. JAX writes a file with the time after each entry, and fails if it is missing."""
     for entry in folder.glob("*-cache"):
         if not entry.with_name(entry.name.removesuffix("-cache") + "-atime").exists():
             entry.unlink()

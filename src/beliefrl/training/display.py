@@ -24,7 +24,7 @@ class TrainingDisplay:
     """
 
     def __init__(self, screen: Screen, run: Run):
-        """`run` is the one that is trained."""
+        """`run` is the run that is trained."""
         self.screen, self.run, self.steps = screen, run, run.options.steps
         self.progress = Progress(
             TextColumn("{task.description:<26}"), BarColumn(), TextColumn("{task.fields[status]}"), auto_refresh=False
@@ -66,7 +66,7 @@ class TrainingDisplay:
             self._evaluated(event)
 
     def _begin_phase(self, event: Event, now: float) -> None:
-        """Begin to time a phase, and print its name where nothing is live."""
+        """Begin to time a phase, and print its name if the screen is not live."""
         self.phase, self.phase_began, self.phase_step = event.phase, now, event.step
         if not self.screen.is_live:
             self.screen.line(event.phase)
@@ -116,7 +116,7 @@ class TrainingDisplay:
 
 
 def results_table(results: dict[str, Any], seeds: list[int], title: str) -> Table:
-    """Returns of every seed, and over seeds mean and standard error, with sampled and with mode actions."""
+    """Returns of every seed with sampled and with mode actions, and their mean and standard error over seeds."""
     table = Table(title=title, title_justify="left")
     modes = ("sampled", "mode")
     measures = [name.removeprefix("seeds_") for name, of in results["sampled"].items() if name[:6] == "seeds_" and of]

@@ -22,11 +22,11 @@ from beliefrl.training.phases import evaluate as evaluate_seed
 from beliefrl.training.rollout import Episode
 from beliefrl.types import LARGEST, UserError, one_line, tuples
 
-MODES = ("sampled", "mode")  # how actions are chosen; the axis of an evaluation's leaves after that of seeds
+MODES = ("sampled", "mode")  # how actions are chosen; the second axis of an evaluation's leaves, after that of seeds
 
 
 def summary(result: Episode) -> dict[str, Any]:
-    """Per mode: every seed's mean return, their mean, its standard error over seeds (None with one), and the measures.
+    """For each mode: the mean return of every seed, their mean, its standard error (None with one seed), the measures.
 
     Leaves of `result` are (seed, mode, episodes).
     """
@@ -54,8 +54,8 @@ def restore(
 ) -> tuple[Agent, Any, Any, str]:
     """The agent, the task, the trained states (leading axis: seed) and the precision (`Run.precision`) of a run.
 
-    `task` is needed only where the run was trained on a task of your own, `agent` only where it is of an agent of your
-    own (`agent_of`). The states are those of the last evaluation, or of the best one of each seed.
+    `task` is needed only if the run was trained on a task of your own, `agent` only if an agent of your own was trained
+    (`agent_of`). The states are those of the last evaluation, or of the best one of each seed.
 
     Raises:
         UserError: the run's agent or task is unknown here, or nothing was saved.
@@ -93,8 +93,8 @@ def agent_of(run: Run, agent: Agent | type | None = None) -> Agent:
 
     Args:
         run: a run.
-        agent: the class of an agent of your own, or one of that class; it gets the hyperparameters that the run
-            records. A run's folder is data, so what only it names is never imported.
+        agent: the class of an agent of your own, or an instance. It gets the hyperparameters that the run records. A
+            run's folder is data, so a class that only the folder names is never imported.
 
     Raises:
         UserError: it is unknown here, one of its settings is unknown or impossible, or `agent` is of another class.
@@ -113,7 +113,7 @@ def agent_of(run: Run, agent: Agent | type | None = None) -> Agent:
 
 
 def as_argument(run: Run) -> str:
-    """How commands take a run: its folder, and --agent if the run has a user's own agent."""
+    """A run as the argument of a command: its folder, and --agent if the run has a user's own agent."""
     name = run.config["agent"]
     return f"{run.folder} --agent {one_line(name)}" if agents.is_own(name) else str(run.folder)
 
@@ -135,7 +135,7 @@ def task_of(run: Run | str | os.PathLike[str]) -> Any:
 
 @contextlib.contextmanager
 def _naming(run: Run) -> Iterator[None]:
-    """Name config.json in a UserError about its content, and the commit that wrote it: it may be another version's."""
+    """Name config.json and the commit that wrote it in a UserError about its content, as the version may differ."""
     try:
         yield
     except UserError as error:
@@ -158,18 +158,19 @@ def evaluate(
     Args:
         run: a run, or its folder.
         episodes: episodes for each seed of the run and each mode.
-        seed: of these episodes: the same seed gives the same numbers.
-        task: needed only where the run was trained on a task of your own.
-        agent: needed only where an agent of your own was trained: its class, or one of them.
-        progress: show that episodes are played, while they are: live in a terminal or a notebook; elsewhere a line
-            after three seconds, and then once a minute.
+        seed: the random seed of these episodes: the same seed gives the same numbers.
+        task: needed only if the run was trained on a task of your own.
+        agent: needed only if an agent of your own was trained: its class, or an instance.
+        progress: show the progress while episodes are played: live in a terminal or a notebook; elsewhere a line after
+            three seconds, and then once a minute.
         best: play with the best agent of each seed, not with its last one. It had the highest mean return, with sampled
             actions, of all evaluations during the training.
 
     Returns:
         {"episodes", "sampled": {"mean", "sem", "seeds", "success", "seeds_success"}, "mode": the same}. Returns are
         undiscounted; "sem" is over seeds and None with one. "success" is a rate in [0, 1], None if the task does not
-        define success. Other measures of the task, such as "distance", stand beside it with "seeds_distance".
+        define success. Other measures of the task have entries of the same kind, such as "distance" and
+        "seeds_distance".
 
     Raises:
         UserError: there is no such run, nothing was saved in it, or a number is impossible.
@@ -192,7 +193,7 @@ def evaluate(
 
 
 def _showing(progress: bool, episodes: int) -> contextlib.AbstractContextManager[Callable[[int], None]]:
-    """Gives a function to call with the number of episodes that have ended; with `progress` they are shown."""
+    """Yields a function to call with the number of finished episodes; with `progress` it is shown."""
     if not progress:
         return contextlib.nullcontext(lambda count: None)
     from beliefrl.training.screen import playing

@@ -29,7 +29,7 @@ class Evaluation:
         notify: Callable[[str], None] | None = None,
         timeout: float | None = None,
     ):
-        """The environments are made at the first evaluation; the last three arguments are as in `Lockstep`."""
+        """The environments are made at the first evaluation. The last three arguments are those of `Lockstep`."""
         self.agent, self.task, self.seeds = agent, task, seeds
         self._how = processes, notify, timeout
         self.environments: Lockstep | None = None
@@ -106,7 +106,7 @@ class _Record:
         return bool(self.episodes.done.all())
 
     def add(self, now: Episode) -> None:
-        """Add the episodes that are `done` and still wanted; leaves (lane,)."""
+        """Add the episodes that are `done` and still needed; leaves (lane,)."""
         lanes = np.flatnonzero(now.done & (self.count < self.episodes.done.shape[1]))
         for column, value in zip(*map(jax.tree.leaves, (self.episodes, now)), strict=True):
             column[lanes, self.count[lanes]] = value[lanes]

@@ -1,13 +1,13 @@
-"""Algorithm 1 where the environments run on the host: the phases of `phases`, with Gymnasium's environments in them.
+"""Algorithm 1 with Gymnasium environments, which run on the host: the same phases as in `phases`.
 
-The agent acts, records and learns by the same functions as in the compiled loop; only the step of the task is outside.
-A call of a compiled function costs as much as acting does, so there is one for every step of the environments:
+The agent acts, records and learns with the same functions as in the compiled loop. Only the step of the task is
+outside. A call of a compiled function takes as much time as acting, so there is one call for each environment step:
 
     act             the first action of a stretch of steps
     environments    a step, in lockstep
     go on           record their results; when a cycle's steps are done, learn (`phases.learn_cycle`); act again
 
-A fault of an environment ends the training with what was learned and recorded until then.
+If an environment fails, the training ends. What was learned and recorded until then is saved.
 """
 
 import ctypes
@@ -72,8 +72,8 @@ def program(
 def keep_memory() -> None:
     """Let the C library keep freed memory for the next call: a setting of the whole process.
 
-    A compiled function takes its scratch memory anew at every call, and where that is large the C library gives it back
-    to the system each time: 10 ms of VRM's updates of a cycle were the system clearing pages again.
+    A compiled function allocates its scratch memory at every call. If it is large, the C library returns it to the
+    system each time, and the system clears the pages again: 10 ms for VRM's updates of a cycle.
     """
     if sys.platform == "linux":
         mmap_threshold, trim_threshold, most = -3, -1, 2**31 - 1

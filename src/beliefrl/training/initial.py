@@ -23,7 +23,7 @@ FILE = "initial.safetensors"
 def taken(options: Options, agent: Agent, spec: Spec) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The initial networks of all seeds by their names, and where they come from, for config.json.
 
-    Seed n starts from seed n of the other run. If that has fewer seeds, they are taken in turn.
+    Seed n starts from seed n of the other run. If the other run has fewer seeds, its seeds are reused in a cycle.
 
     Raises:
         UserError: there is no such run, it has no trained agent, or the agents differ in an array.

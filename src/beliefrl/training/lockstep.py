@@ -1,6 +1,7 @@
-"""Gymnasium environments stepped together, one per lane, in this process or each in a process of its own.
+"""Gymnasium environments that are stepped together, one per lane, in this process or each in its own process.
 
-The environments do not reset themselves: `restart` begins the next episode, after its last observation was returned.
+The environments do not reset themselves. `restart` begins the next episode after the last observation of an episode
+was returned.
 """
 
 import contextlib
@@ -21,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from beliefrl.tasks.gymnasium import Environment, Fault, GymnasiumTask
 from beliefrl.types import UserError
 
-HANDOVER = 5e-4  # seconds that giving a step to other processes costs, about
+HANDOVER = 5e-4  # approximate seconds for passing a step to other processes
 PATIENCE = 5.0  # seconds in which a process can end by itself
 SLOW = 60.0  # seconds after which a call that has not returned is reported
 
@@ -61,9 +62,9 @@ class Lockstep:
             lanes: for example "seed 0".
             processes: "always" gives each a process of its own, "never" none, "auto" decides by a measurement.
                 Each process imports the main module of this one: guard it by `if __name__ == "__main__":`.
-            notify: called from another thread with a sentence when making, a reset or a step takes longer than SLOW.
-            timeout: most seconds of a step; a longer one raises a Fault. Environments in this process have no limit:
-                nothing can interrupt them.
+            notify: called from another thread with a sentence if making, a reset or a step takes longer than SLOW.
+            timeout: maximum seconds of a step; a longer step raises a Fault. Environments in this process have no
+                limit, because nothing can interrupt them.
 
         Raises:
             UserError: the environment cannot be made, or is not supported.
@@ -121,7 +122,7 @@ class Lockstep:
 
     @contextlib.contextmanager
     def _calling(self, name: str) -> Iterator[None]:
-        """Note the call that is under way. Raises a Fault if a lane's process dies during it, or takes too long."""
+        """Record the current call. Raises a Fault if the process of a lane dies during the call, or takes too long."""
         self._call = _Call(name, time.monotonic())
         try:
             with _silence():
@@ -186,13 +187,13 @@ def _silence() -> Iterator[None]:
 
 
 def _pays(task: GymnasiumTask, lanes: int) -> bool:
-    """Whether processes of their own save more than they cost: by the time that some random steps take."""
+    """Whether processes of their own are faster, measured with some random steps."""
     cores = min(lanes, os.cpu_count() or 1)
     return cores > 1 and lanes * step_seconds(task) * (1 - 1 / cores) > HANDOVER
 
 
 def step_seconds(task: GymnasiumTask, steps: int = 20) -> float:
-    """The median time of a step with random actions; 0 where that cannot be measured."""
+    """The median time of a step with random actions; 0 if it cannot be measured."""
     try:
         environment = task.environment()
         environment.reset(seed=0)

@@ -1,4 +1,4 @@
-"""What a training writes of its events in the log of each seed."""
+"""The entries that a training writes to the log of each seed, for its events."""
 
 from collections.abc import Collection
 from typing import Any

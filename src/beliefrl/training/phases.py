@@ -1,13 +1,12 @@
 """Algorithm 1 of the paper: explore, pre-train, then learn in cycles; compiled, and for many seeds in one program.
 
     explore    step_start_rl environment steps with the untrained policy
-    pretrain   updates on what they recorded; then the actor and the replay perceive it again
-    learn      cycles: act and record for the steps of one; then draw from the replay for it, and make its updates
+    pretrain   updates on these steps; then the states in the replay and the actor's memory are computed again
+    learn      cycles: act and record for the steps of a cycle; then sample from the replay, and make the updates
 
-The step counter stays outside what is mapped over seeds, and each phase is a compiled function of its own, called
-for a stretch of steps whose number is an argument: one compilation serves all stretches, and no result depends on
-how the training is cut into them. Random keys are derived from the seed's key and the running number of the step.
-`schedule` decides which phase is called when.
+The step counter is not mapped over seeds. Each phase is a compiled function of its own, called for a block (stretch) of
+steps. The number of steps is an argument, so each phase is compiled once, and no result depends on the length of the
+blocks. Random keys are derived from the seed's key and the number of the step. `schedule` calls the phases.
 
 The loops over steps, updates and cycles are outside what is mapped over seeds: JAX traces the body of a loop that is
 mapped three times, and that of a loop over a mapped body once.

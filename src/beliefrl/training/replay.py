@@ -1,8 +1,8 @@
 """The replay: a ring of timesteps, and windows drawn from it.
 
-One record per timestep, an episode's last observation included, so a truncated episode keeps what its value is
-bootstrapped from, and no observation is stored twice. Additions come before draws within a compiled step, and a
-masked addition writes out of bounds instead of branching: either mistake makes XLA copy the whole ring.
+The ring has one record per timestep, including the last observation of an episode. So the value at a time limit can be
+bootstrapped, and no observation is stored twice. Within a compiled step, additions come before draws, and a masked
+addition writes out of bounds and does not branch. Otherwise XLA copies the whole ring.
 """
 
 from typing import Any, NamedTuple
@@ -34,7 +34,7 @@ def capacity(replay: Replay) -> int:
 
 
 def add(replay: Replay, timestep: StoredTimestep, keep: Bool[Array, ""] | bool = True) -> Replay:
-    """Append a timestep where `keep`; the oldest makes room."""
+    """Append a timestep if `keep`; it replaces the oldest one in a full ring."""
     size = capacity(replay)
     index = jnp.where(keep, replay.added % size, size)
     timesteps = jax.tree.map(lambda ring, leaf: ring.at[index].set(leaf, mode="drop"), replay.timesteps, timestep)
@@ -75,7 +75,7 @@ def gather(replay: Replay, number: Int[Array, "*shape"], ring: Int[Array, "1 bat
 
 
 def history(replay: Replay, length: int) -> tuple[Timestep, Bool[Array, " length"]]:
-    """The first `length` timesteps ever added, and which of them exist; meant for before the ring is full."""
+    """The first `length` timesteps ever added, and which of them exist, for use before the ring is full."""
     number = jnp.arange(length)
     return gather(replay, number).step, number < replay.added
 

@@ -1,13 +1,13 @@
 """An agent in its task: act, step, time limit, reset, record; and evaluation.
 
-What happens in one environment step, at timestep t of an episode:
+One environment step, at timestep t of an episode:
 
     the agent perceives timestep t and acts        -> a_t, memory
     the replay stores timestep t and the agent's note
     the task steps                               -> timestep t+1
     if it is terminal or the time limit is reached, the replay stores timestep t+1 as well and a new episode begins
 
-So every step of the loop is one step of the environment, and the current timestep is never in the replay yet.
+So every step of the loop is one step of the environment, and the current timestep is not yet in the replay.
 All functions are for one seed; `phases` maps them over seeds.
 """
 
@@ -38,7 +38,7 @@ TAKEN = {"step", "kind", "return", "length"}  # entries of an episode in the log
 
 
 class Episode(NamedTuple):
-    """What an environment step reports of its episode; the other fields count only where `done`."""
+    """The report of an environment step about its episode. The other fields are valid only where `done`."""
 
     done: Bool[Array, "*batch"]
     episode_return: Float[Array, "*batch"]  # undiscounted
@@ -47,7 +47,7 @@ class Episode(NamedTuple):
 
 
 def no_episodes(spec: Spec, shape: tuple[int, ...]) -> Episode:
-    """Of a shape, with nothing in them."""
+    """Empty reports of this shape."""
     number = jnp.zeros(shape)
     return Episode(number.astype(bool), number, number.astype(int), dict.fromkeys(spec.measures, number))
 
@@ -56,7 +56,7 @@ def measured(task: Task, task_state: Any) -> dict[str, Float[Array, ""]]:
     """The measures of a task at a state.
 
     Raises:
-        UserError: the task does not return what its `spec.measures` names.
+        UserError: the task does not return the measures that `spec.measures` names.
     """
     names, kind = task.spec.measures, type(task).__name__
     found: Any = task.measures(task_state) if names else {}  # pyright: ignore[reportAttributeAccessIssue]
@@ -68,7 +68,7 @@ def measured(task: Task, task_state: Any) -> dict[str, Float[Array, ""]]:
 
 
 def strong(tree: Any) -> Any:
-    """The tree without weak types. Python numbers in a task or agent leave them, and XLA would compile twice."""
+    """The tree without weak types. Python numbers in a task or agent cause them, and then XLA compiles twice."""
 
     def cast(leaf: Any) -> Array:
         leaf = jnp.asarray(leaf)
@@ -91,19 +91,19 @@ def first(agent: Agent, spec: Spec, task_state: Any, obs: Float[Array, " obs"]) 
 
 
 def begin(agent: Agent, task: Task, key: Key[Array, ""]) -> ActorState:
-    """An episode begins."""
+    """The actor at the start of an episode."""
     return first(agent, task.spec, *task.reset(key))
 
 
 def stored(agent: Agent, actor: ActorState) -> StoredTimestep:
-    """A timestep as the replay stores it; only shapes and types matter."""
+    """A timestep in the form in which the replay stores it; only shapes and types are used."""
     return StoredTimestep(actor.step, agent.note(actor.memory))
 
 
 def act(
     agent: Agent, state: Any, actor: ActorState, key: Key[Array, ""], explore: Bool[Array, ""]
 ) -> tuple[Float[Array, " action"], Any]:
-    """The action at the current timestep, and the memory after it; `key` is that of `move`."""
+    """The action at the current timestep, and the memory after it; `key` is the key of `move`."""
     key_act, _ = jax.random.split(key)
     return agent.act(state, actor.memory, actor.step, key_act, explore)
 
@@ -117,7 +117,7 @@ def arrive(
     reward: Float[Array, ""],
     terminated: Bool[Array, ""],
 ) -> ActorState:
-    """The next timestep, terminal or not, with the memory after the one before it."""
+    """The next timestep, terminal or not, with the memory after the previous timestep."""
     step = Timestep(obs, reward, action, jnp.array(False), terminated)
     return strong(ActorState(task_state, step, memory, actor.length + 1, actor.episode_return + reward))
 
@@ -144,9 +144,9 @@ def record(
     done: Bool[Array, ""],
     key: Key[Array, ""],
 ) -> tuple[ActorState, Replay]:
-    """Store the current timestep, and `after` where it is the last; returns the actor at the new current one."""
+    """Store the current timestep, and `after` if it is the last; returns the actor at the new current timestep."""
     replay = ring.add(replay, StoredTimestep(actor.step, agent.note(after.memory)))
-    # Only its note is used: where that needs no action, XLA drops the acting.
+    # Only the note is used. If it does not depend on the action, XLA removes the acting.
     _, last = agent.act(state, after.memory, after.step, key, jnp.array(True))
     replay = ring.add(replay, StoredTimestep(after.step, agent.note(last)), done)
     return jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, after), replay
@@ -155,7 +155,7 @@ def record(
 def advance(
     agent: Agent, task: Task, state: Any, actor: ActorState, replay: Replay, key: Key[Array, ""]
 ) -> tuple[ActorState, Replay, Episode]:
-    """One environment step of training, recorded."""
+    """Make and record one environment step of training."""
     key_move, key_last, key_reset = jax.random.split(key, 3)
     after, episode = move(agent, task, state, actor, key_move, jnp.array(True))
     fresh = begin(agent, task, key_reset)
@@ -165,9 +165,9 @@ def advance(
 def refresh(
     agent: Agent, spec: Spec, state: Any, actor: ActorState, replay: Replay, key: Key[Array, ""], length: int
 ) -> tuple[ActorState, Replay]:
-    """Perceive the first `length` timesteps of the replay again, with networks that have changed since.
+    """Perceive the first `length` timesteps of the replay again, with the changed networks.
 
-    Returns the actor with the memory it would have now, and the replay with new notes.
+    Returns the actor with the memory that these networks give, and the replay with new notes.
     """
     steps, exists = ring.history(replay, length)
     empty = agent.reset(spec)
@@ -185,9 +185,9 @@ def refresh(
 
 
 def evaluate(agent: Agent, task: Task, state: Any, key: Key[Array, ""], explore: Bool[Array, " episodes"]) -> Episode:
-    """Whole episodes in parallel, apart from training; leaves (episodes,).
+    """Play whole episodes in parallel, apart from training; leaves (episodes,).
 
-    `explore` says of each episode whether actions are sampled; else they are the policy's mode.
+    `explore` defines for each episode whether actions are sampled. Otherwise they are the mode of the policy.
     """
     key_reset, key_steps = jax.random.split(key)
     episodes = explore.shape[0]

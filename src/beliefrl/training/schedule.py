@@ -1,7 +1,7 @@
-"""Training from the first step to the last, on the host: which phase is called when.
+"""Training from the first step to the last, on the host: the order of the phases.
 
-The loop is Python over compiled stretches (`phases`); a compiled function never calls back. `stages` yields what
-happens, `train` records it in a run's folder.
+The loop is Python over compiled blocks, called stretches (`phases`). A compiled function never calls back. `stages`
+yields events, and `train` records them in a run's folder.
 """
 
 import enum
@@ -22,7 +22,7 @@ from beliefrl.types import UserError
 
 
 class TrainingProgress(NamedTuple):
-    """How far a training is; with all its arrays, all that is needed to go on."""
+    """The position of a training. With all its arrays, it is sufficient to continue."""
 
     step: int = 0
     pretrained: int = 0  # updates of the pre-training
@@ -31,14 +31,14 @@ class TrainingProgress(NamedTuple):
 
 
 class Snapshot(NamedTuple):
-    """A training between two stretches; the next stretch takes over the memory of its arrays."""
+    """A training between two stretches. The next stretch reuses the memory of its arrays."""
 
     progress: TrainingProgress
     seeds: SeedState
 
 
 class Phase(enum.StrEnum):
-    """What a training does; the values are what is shown."""
+    """The activity of a training; the values are shown to the user."""
 
     STARTING = "starting"
     RESUMING = "resuming"
@@ -51,13 +51,13 @@ class Phase(enum.StrEnum):
     COMPILING_LEARNING = "compiling the learning"
     LEARNING = "learning"
     EVALUATING = "evaluating"
-    TRAINING = "training"  # for notes from another thread, which do not know the phase
+    TRAINING = "training"  # for notes from another thread, which does not know the phase
     FAULT = "stopped by a fault"
     FINISHED = "finished"
 
     @property
     def is_compiling(self) -> bool:
-        """Whether nothing but a compilation happens."""
+        """Whether the phase is only a compilation."""
         return self in (
             Phase.COMPILING_AGENT,
             Phase.COMPILING_EXPLORATION,
@@ -67,16 +67,16 @@ class Phase(enum.StrEnum):
 
 
 class Event(NamedTuple):
-    """What has just happened in a training; fields beyond the first three only where they apply."""
+    """An event of a training. The fields after the first three are set only if they apply."""
 
-    phase: Phase  # what comes next
+    phase: Phase  # the next one
     step: int  # environment steps of each seed so far
-    metrics: Metrics = {}  # leaves (seed,): means over the last stretch
-    episodes: Episode | None = None  # leaves (seed, stretch)
+    metrics: Metrics = {}  # leaves (seed,): means over the last block of steps
+    episodes: Episode | None = None  # leaves (seed, step): of the last block
     evaluation: Episode | None = None  # leaves (seed, mode, episodes)
-    states: Any = None  # the agents, where they should be saved
-    part: tuple[int, int] | None = None  # of the pre-training: updates done, of how many
-    snapshot: Snapshot | None = None  # where a training can stop and be resumed
+    states: Any = None  # the agents, if they should be saved
+    part: tuple[int, int] | None = None  # of the pre-training: updates done, and their total
+    snapshot: Snapshot | None = None  # if the training can stop and be resumed here
     note: str | None = None  # another message for the user, a sentence
 
 
@@ -89,20 +89,20 @@ def stages(
     own_process: bool = False,
     initial: Callable[[Any], Any] | None = None,
 ) -> Generator[Event, None, None]:
-    """Train; yields an Event before whatever takes long and after whatever has results.
+    """Train; yields an Event before each long operation, and after each operation with results.
 
     Args:
         agent: the agent to train.
         task: the task to train it on.
-        options: how long, how often, and how it is evaluated.
-        restore: given the shapes of a training's arrays, returns the snapshot to go on from.
+        options: the options of the training.
+        restore: given the shapes of a training's arrays, returns the snapshot from which to continue.
         notify: called from another thread with a sentence that cannot wait for the next Event.
         own_process: as in `train`.
         initial: given the agents' random first states, returns the states to start from (`initial.started`). There is
-            no pre-training then: its result came with them.
+            no pre-training then, because the networks of the other run have had one.
 
     Raises:
-        Fault: of a Gymnasium environment, after an Event with what was learned until then.
+        Fault: a Gymnasium environment failed. It is raised after an Event with everything learned until then.
     """
     numbers = range(options.seed, options.seed + options.seeds)
     sizes = capacity(agent, options), options.eval_episodes
@@ -199,13 +199,13 @@ def _stages(
         yield Event(Phase.FINISHED, at.step, snapshot=Snapshot(at._replace(evaluated=at.step), seeds))
 
 
-ROOM = 1.25  # timesteps in the replay for each step: with episodes of 4 steps and more it holds the whole training
+ROOM = 1.25  # timesteps in the replay per step: with episodes of at least 4 steps it has the whole training
 
 
 def capacity(agent: Agent, options: Options) -> int:
     """Timesteps in the replay of each environment: one for each of its steps, and room for those that end episodes.
 
-    Where episodes are shorter than 4 steps on average, the oldest timesteps are replaced before the training ends.
+    If episodes are shorter than 4 steps on average, the oldest timesteps are replaced before the training ends.
 
     Raises:
         UserError: `replay_capacity` has no room for the exploration, or for a window.
@@ -221,7 +221,7 @@ def capacity(agent: Agent, options: Options) -> int:
 
 
 def _processes(options: Options, own_process: bool) -> Processes:
-    """Whether environments have processes of their own, where "auto" depends on the program and on a time limit."""
+    """Whether environments have processes of their own; "auto" depends on the program and on a time limit."""
     if options.processes != "auto":
         return options.processes
     if not own_process:

@@ -1,4 +1,4 @@
-"""A training while it runs: its log, its checkpoints, seeds that diverge, and what ends it before its last step.
+"""A training while it runs: its log, its checkpoints, seeds that diverge, and reasons to end before the last step.
 
 A signal or the user's callback stops it, and it can be resumed. With the option `stop_at` it is finished when the
 returns are high enough.
@@ -58,7 +58,7 @@ class Session:
         self.is_stopped = False  # by the callback
         self.ended: str | None = None  # why the training is finished before its last step, a sentence
         self.was_finished = False  # before it was resumed
-        self.requests = Requests(partial(self._note, "stopping after this stretch; Ctrl-C again ends at once"))
+        self.requests = Requests(partial(self._note, "stopping after this block of steps; Ctrl-C again ends at once"))
 
     def run(
         self,
@@ -68,7 +68,7 @@ class Session:
         """Train to the last step, or until something ends the training before it.
 
         Args:
-            restore: `Session.restore`, to go on from a checkpoint.
+            restore: `Session.restore`, to continue from a checkpoint.
             networks: the first networks of a new training, if they come from another run (`initial.taken`).
         """
         keep_compiled(self._note)
@@ -154,7 +154,7 @@ class Session:
         self._report(Event(Phase.TRAINING, self.step, note=note))
 
     def _reached(self, step: int) -> str | None:
-        """What to say if the returns have reached `stop_at` at this step."""
+        """The message if the returns have reached `stop_at` at this step."""
         line, patience = self.options.stop_at, self.options.stop_patience
         if not self.recorder.reached(line, patience):
             return None
@@ -163,7 +163,7 @@ class Session:
         return f"ended at step {step:,}, because {whose} was at least {line:g}{when}"
 
     def _look_for_divergence(self, event: Event) -> None:
-        """Drop seeds whose losses or networks are no longer finite; the others go on."""
+        """Drop seeds whose losses or networks are no longer finite. The others continue."""
         losses = {
             name: event.metrics[name] for name in event.metrics if name.removeprefix("pretrain_") in self.agent.losses
         }
@@ -209,7 +209,7 @@ class Session:
         """
         if not self._is_due(event, snapshot):
             return False
-        self._look_at_networks(snapshot.seeds.state, event)  # no checkpoint has networks that were not looked at
+        self._look_at_networks(snapshot.seeds.state, event)  # networks are checked before each checkpoint
         progress, asked = snapshot.progress, self.requests.number
         if progress.refreshed and not self.last.refreshed:
             self.checkpoints.forget_timesteps()
@@ -219,7 +219,7 @@ class Session:
         go_on = f"`beliefrl resume {as_argument(self.recorder)}` goes on from there"
         go_on = f"{go_on}, in Python beliefrl.resume({str(self.recorder.folder)!r})"
         if event.phase is Phase.FAULT:
-            with contextlib.suppress(UserError):  # the fault itself is raised next
+            with contextlib.suppress(UserError):  # the Fault itself is raised next
                 self.checkpoints.wait()
                 self._note(f"saved at step {progress.step:,}; {go_on}")
         elif asked:

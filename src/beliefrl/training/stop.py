@@ -1,6 +1,6 @@
 """Ctrl-C and SIGTERM: the first asks a training to stop, the second ends the program at once.
 
-A program that leaves `Stopped` uncaught ends with its sentence and its exit code, and shows no traceback.
+If a program does not catch `Stopped`, it ends with the sentence and the exit code of `Stopped`, without a traceback.
 """
 
 import contextlib
@@ -15,14 +15,14 @@ from types import FrameType, TracebackType
 from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-ONE_REQUEST = 0.3  # seconds in which several signals count as one: a parent that dies may send one per thread
+ONE_REQUEST = 0.3  # seconds in which several signals count as one, because a dying parent may send one per thread
 
 
 class Stopped(KeyboardInterrupt):
-    """A training was stopped by a signal; its message says how to go on.
+    """A training was stopped by a signal. The message says how to continue it.
 
-    Uncaught, it ends a script with that sentence and `exit_code`: 130 for Ctrl-C, 143 for SIGTERM. In an interactive
-    session or a notebook the sentence is shown, and the session goes on.
+    If it is not caught, a script ends with this sentence and `exit_code`: 130 for Ctrl-C, 143 for SIGTERM. In an
+    interactive session or a notebook the sentence is shown, and the session continues.
     """
 
     def __init__(self, message: str, number: int):
@@ -30,19 +30,19 @@ class Stopped(KeyboardInterrupt):
         self.exit_code = 128 + number
 
     def _render_traceback_(self) -> list[str]:
-        """What IPython shows in place of a traceback."""
+        """The lines that IPython shows in place of a traceback."""
         return [f"beliefrl: {self}"]
 
 
 class Requests:
-    """Inside the `with` block, the first signal is stored in `number`; a later one ends the program at once.
+    """Inside the `with` block, the first signal is stored in `number`. A later one ends the program at once.
 
-    In an interactive session a later one raises Stopped, as soon as a compiled function returns: the session's
-    variables are not lost. A Stopped that leaves is shown without a traceback if nobody catches it.
+    In an interactive session a later signal raises Stopped as soon as a compiled function returns, so the variables of
+    the session are not lost. A Stopped that nobody catches is shown without a traceback.
 
-    Python runs handlers between two of its own instructions, so a signal during a compiled function waits until that
-    returns. The system therefore also writes each signal to a socket at once. A thread reads it: it confirms the first
-    signal and ends the program at the second.
+    Python runs handlers between two of its own instructions, so a signal during a compiled function waits until the
+    function returns. Therefore the system also writes each signal to a socket at once. A thread reads the socket. It
+    confirms the first signal and ends the program at the second.
     """
 
     def __init__(self, confirm: Callable[[], None] = lambda: None):
@@ -95,13 +95,14 @@ class Requests:
 
 
 def is_interactive() -> bool:
-    """Whether someone types at a prompt: Python's, IPython's, or a notebook."""
+    """Whether the session is interactive: a prompt of Python or IPython, or a notebook."""
     return hasattr(sys, "ps1") or bool(sys.flags.interactive)
 
 
 def _show_without_traceback() -> None:
-    """From now on an uncaught Stopped is a sentence and an exit code. Python has no other place to say so than its
-    hook for uncaught exceptions; it gets all others as before.
+    """From now on, show an uncaught Stopped as a sentence and an exit code.
+
+    This replaces Python's hook for uncaught exceptions, and passes all other exceptions on to the previous hook.
     """
     before = sys.excepthook
 

@@ -22,7 +22,7 @@ from beliefrl.training.schedule import Event, Options, capacity
 from beliefrl.training.session import Callback, Session
 from beliefrl.types import UserError
 
-CHANGEABLE = ("steps", "stop_at", "stop_patience", "step_timeout")  # options that may differ when a training goes on
+CHANGEABLE = ("steps", "stop_at", "stop_patience", "step_timeout")  # options that may differ when a training continues
 
 
 def train(
@@ -42,18 +42,18 @@ def train(
         agent: an agent, or the name of one with its default hyperparameters (`make_agent`).
         task: a task, or the name of one.
         out: the run's folder; None is runs/AGENT-TASK-1, or the next free number. It must not exist, unless it is empty
-            or a training left it that ended before it saved an agent or a checkpoint; then it is used again.
-        report: called with every Event when it happens; what it returns is ignored.
+            or a training left it that ended before it saved an agent or a checkpoint. Such a folder is used again.
+        report: called with every Event when it happens; its return value is ignored.
         callback: the same, but it can stop the training. If it returns True, the training writes a checkpoint after
-            its current stretch of about 100 steps and stops; `resume` goes on. Any other value, such as None, changes
+            its current block of about 100 steps and stops; `resume` continues. Any other value, such as None, changes
             nothing. (In Stable-Baselines3 a callback returns False to stop.) Urgent notes come from another thread.
-            An exception of the callback ends the training; what was saved stays.
+            An exception of the callback ends the training. Saved files are kept.
         own_process: True says that this process only trains, and that it guards its main module (`if __name__ == ...`).
             Then processes="auto" may start processes, and training on a Gymnasium environment lets the C library keep
-            freed memory. The command line says so.
-        progress: show what the training does: live in a terminal, live with the learning curve in a notebook, elsewhere
-            a line for each phase and each evaluation, and at least one a minute. False shows nothing.
-        resume: go on with the training in `out`, if there is one already. It must have been started with the same
+            freed memory. The command line sets it to True.
+        progress: show the progress: live in a terminal, live with the learning curve in a notebook, elsewhere a line
+            for each phase and each evaluation, and at least one per minute. False shows nothing.
+        resume: continue the training in `out`, if there is one already. It must have been started with the same
             agent, task and options. `steps` may be larger; stop_at, stop_patience and step_timeout may be different.
         options: the fields of `Options`: steps, seeds, seed, eval_every, eval_episodes, stop_at, stop_patience,
             init_from, init_best, replay_capacity, processes, step_timeout, checkpoint_steps, checkpoint_minutes,
@@ -63,10 +63,10 @@ def train(
         The run: its results, its log, its files (`runs`). It is finished, unless the callback has stopped it.
 
     Raises:
-        UserError: an unknown name or option, an impossible value, `out` exists (with `resume`: and was trained
-            otherwise), a tracker cannot be opened, the disk is full, or a Gymnasium environment is faulty; then what
-            was learned and logged until that step is saved.
-        Stopped: Ctrl-C or SIGTERM, once a checkpoint is written; `resume` goes on. It is a KeyboardInterrupt.
+        UserError: an unknown name or option, an impossible value, `out` exists (with `resume`: and was trained with
+            other settings), a tracker cannot be opened, the disk is full, or a Gymnasium environment fails. Then
+            everything until that step is saved.
+        Stopped: Ctrl-C or SIGTERM, after a checkpoint is written; `resume` continues. It is a KeyboardInterrupt.
     """
     agent = agents.make(agent) if isinstance(agent, str) else agent
     made: Any = tasks.make(task) if isinstance(task, str) else task
@@ -105,26 +105,26 @@ def resume(
     stop_at: float | Literal["same"] | None = "same",
     step_timeout: float | Literal["same"] | None = "same",
 ) -> Run:
-    """Go on with a training from its last checkpoint.
+    """Continue a training from its last checkpoint.
 
     On one machine and kind of device, metrics and networks are bit-identical to those of an uninterrupted training
-    (measured on CPU, not on a GPU). A Gymnasium environment cannot be saved: a new episode begins there. A training
-    that was stopped before its first checkpoint begins again from step 0.
+    (measured on a CPU, not on a GPU). A Gymnasium environment cannot be saved, so a new episode begins. A training that
+    was stopped before its first checkpoint starts again from step 0.
 
     Args:
         run: a run, or its folder.
-        steps: train for so many environment steps in all; None: as many as before. They may only grow.
-        task: needed only where the run was trained on a task of your own.
+        steps: the total number of environment steps; None: as many as before. It cannot be reduced.
+        task: needed only if the run was trained on a task of your own.
         report, own_process, progress, callback: as in `train`.
-        agent: needed only where an agent of your own was trained: its class, or an instance.
+        agent: needed only if an agent of your own was trained: its class, or an instance.
         stop_at: the option `stop_at` from now on; None: train for all steps; "same": as before. A training that has
-            reached its `stop_at` is finished, and goes on only with a higher one or None.
+            reached its `stop_at` is finished, and continues only with a higher one or None.
         step_timeout: the option `step_timeout` from now on; None: no limit; "same": as before.
 
     Raises:
-        UserError: there is no such run, none of its checkpoints is good or left, another process trains it, or `steps`
-            are too few.
-        Stopped: Ctrl-C or SIGTERM, once a checkpoint is written.
+        UserError: there is no such run, it has no undamaged checkpoint, another process trains it, or `steps` is too
+            small.
+        Stopped: Ctrl-C or SIGTERM, after a checkpoint is written.
     """
     given = {"steps": "same" if steps is None else steps, "stop_at": stop_at, "step_timeout": step_timeout}
     changes = {name: value for name, value in given.items() if value != "same"}
@@ -141,7 +141,7 @@ def _go_on(
     own_process: bool,
     progress: bool,
 ) -> Run:
-    """Go on with a training; `changes` are its new options, `listeners` are `report` and `callback`."""
+    """Continue a training; `changes` are its new options, `listeners` are `report` and `callback`."""
     folder, made_by = run.folder, agent_of(run, agent)
     begins_again = not was_ever_written(folder) and not (folder / "results.json").exists()
     if not (begins_again or listed(folder)):
@@ -167,7 +167,7 @@ def _go_on(
 
 @contextlib.contextmanager
 def _reporting(run: Run, report: Callback | None, callback: Callback | None, progress: bool) -> Iterator[Callback]:
-    """What is called with every Event: the display, unless `progress` is False, `report`, and `callback`.
+    """A function that calls the display (unless `progress` is False), `report` and `callback` with an Event.
 
     It returns what `callback` returns.
     """
@@ -200,7 +200,7 @@ def _chosen(options: dict[str, Any]) -> Options:
 
 
 def _check_possible(options: Options, task: Any, own_process: bool) -> None:
-    """Raise a UserError if options need a package, or processes, that are not there."""
+    """Raise a UserError if options need a package or processes that are not available."""
     trackers.check(options.track)
     if options.step_timeout and isinstance(task, GymnasiumTask) and options.processes == "auto" and not own_process:
         raise UserError(
@@ -210,7 +210,7 @@ def _check_possible(options: Options, task: Any, own_process: bool) -> None:
 
 
 def _check_same(run: Run, config: dict[str, Any]) -> None:
-    """Raise a UserError where a run was trained with other settings than `config` has, but for CHANGEABLE options."""
+    """Raise a UserError if a run was trained with other settings than those of `config`, except CHANGEABLE options."""
     asked = {name: config.get(name) for name in ("agent", "task", "constants", "observe", "faults")}
     asked = asked | config["options"] | config["hyperparameters"]
     asked = json.loads(json.dumps(asked, default=str))  # tuples are lists in the run's config
