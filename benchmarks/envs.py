@@ -1,7 +1,7 @@
 """Steps per second with a slow Gymnasium environment, by the number of environments (--envs): python benchmarks/envs.py
 
-A step of the environment sleeps for 20 ms, as if it waited for a simulator or a robot. Each environment has a process of
-its own. The steps are those of the exploration, without updates.
+A step of the environment sleeps for 20 ms, as if it waited for a simulator or a robot. Each environment has a process
+of its own. The steps are those of the exploration, without updates.
 """
 
 import tempfile
