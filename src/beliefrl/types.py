@@ -84,10 +84,11 @@ def as_array(value: Any) -> np.ndarray:
 
 def check_choice(settings: object, name: str, choices: Sequence[str | bool]) -> None:
     """Raise a UserError if a field of `settings` is not one of the choices."""
-    if getattr(settings, name) not in choices:
-        raise UserError(
-            f"{name}={getattr(settings, name)!r} is impossible: it must be {' or '.join(map(str, choices))}."
-        )
+    value = getattr(settings, name)
+    if not any(
+        value == choice and isinstance(value, bool) == isinstance(choice, bool) for choice in choices
+    ):  # 1 == True
+        raise UserError(f"{name}={value!r} is impossible: it must be {' or '.join(map(str, choices))}.")
 
 
 class Spec(NamedTuple):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from beliefrl.runs import arrays, checkpoint
-from beliefrl.runs.checkpoint import Checkpoints
+from beliefrl.runs.checkpoint import Checkpoints, listed
 from beliefrl.types import UserError
 
 CAPACITY, SEEDS = 8, 2
@@ -286,6 +286,55 @@ def test_what_a_kill_leaves_behind_is_cleared_away(three):
     checkpoints.restore(tree(), ring.timesteps)
     saved(checkpoints, ring, 40)
     assert not left.exists()
+
+
+def test_a_ring_that_grew_after_it_wrapped_has_only_what_was_saved(tmp_path):
+    checkpoints, ring = Checkpoints(tmp_path, keep=1), Ring()
+    ring.add(CAPACITY + 3, CAPACITY + 3)
+    saved(checkpoints, ring, 10)
+    larger = {
+        name: np.zeros((SEEDS, 2 * CAPACITY, *leaf.shape[2:]), leaf.dtype) for name, leaf in ring.timesteps.items()
+    }
+    checkpoints = Checkpoints(tmp_path, keep=1)
+    found = checkpoints.restore(tree(), larger)
+    np.testing.assert_array_equal(found.missing, 3)
+    np.testing.assert_array_equal(found.timesteps["obs"][0, :CAPACITY, 0], 3 + np.arange(CAPACITY))
+    checkpoints.save(20, {}, tree(), found.timesteps, ring.added - found.missing)
+    checkpoints.close()
+    again = Checkpoints(tmp_path, keep=1).restore(tree(), larger)
+    equal(again.timesteps, found.timesteps)
+    assert not again.missing.any()
+
+
+def test_files_that_the_ring_has_overwritten_are_removed(tmp_path):
+    checkpoints, ring = Checkpoints(tmp_path, keep=1), Ring()
+    for step in range(1, 11):
+        ring.add(CAPACITY // 2, CAPACITY // 2)
+        saved(checkpoints, ring, step)
+    assert len(list((tmp_path / "checkpoints" / "replay").iterdir())) <= 3
+    found = restored(tmp_path)
+    equal(found.timesteps, ring.timesteps)
+
+
+def test_a_damaged_older_checkpoint_does_not_prevent_saving(three):
+    folder, _ = three
+    listed(folder)[1].joinpath("manifest.json").write_text("{")
+    checkpoints, ring = Checkpoints(folder, keep=3), Ring()
+    checkpoints.restore(tree(), ring.timesteps)
+    saved(checkpoints, ring, 40)
+    assert restored(folder).step == 40
+
+
+def test_a_seed_that_is_lost_twice_keeps_the_newer_checkpoint(tmp_path):
+    checkpoints, ring = Checkpoints(tmp_path, keep=1), Ring()
+    for step in (10, 20):
+        ring.add(1, 1)
+        saved(checkpoints, ring, step)
+        kept = checkpoints.keep_for("seed-999999")
+        assert json.loads((kept / "manifest.json").read_bytes())["content"]["step"] == step
+    ring.add(1, 1)
+    saved(checkpoints, ring, 30)
+    assert restored(tmp_path).step == 30
 
 
 def test_the_last_good_one_of_a_lost_seed_is_kept(tmp_path):

@@ -48,6 +48,43 @@ def test_a_compiled_task_shows_what_a_mask_hides():
     assert shorter.episodes == 20
 
 
+def test_a_faulty_task_shows_what_is_observed_of_the_whole():
+    found = beliefrl.check(tasks.make("pendulum", observe=[2, 0], faults={"noise": 0.1}))
+    assert [entry.position for entry in found.entries] == [1, None, 0]
+
+
+def test_an_environment_that_fills_the_same_array_again_changes():
+    class Same(Fine):
+        obs = np.zeros(2, np.float32)
+
+        def step(self, action):
+            _, *rest = super().step(action)
+            self.obs[:] = self.np_random.uniform(-1, 1, 2)
+            return self.obs, *rest
+
+        def close(self):
+            raise RuntimeError("the socket is closed already")
+
+    assert "never changed" not in warned(Same)
+
+
+def test_constants_may_have_the_names_of_the_command(capsys):
+    for constant in ("seed=1", "steps=2"):
+        with pytest.raises(SystemExit) as ended:
+            cli.main(["check", "gym:Pendulum-v1", "--constants", constant])
+        assert ended.value.code == 2
+        err = capsys.readouterr().err
+        assert err.startswith("beliefrl: gym:Pendulum-v1")
+        assert err.count("\n") == 1
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("number", [1.5, "3", 0])
+def test_steps_are_a_whole_number(number):
+    with pytest.raises(UserError, match=f"steps={number} is impossible: it must be a whole number"):
+        beliefrl.check("pendulum", steps=number)
+
+
 def test_the_time_limit_of_a_compiled_task_ends_episodes():
     assert beliefrl.check(dataclasses.replace(tasks.make("pendulum"), max_steps=7), steps=21).episodes == 3
     assert beliefrl.check(Counting()).task.endswith("Counting")

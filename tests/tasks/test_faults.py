@@ -181,6 +181,13 @@ def test_runs_are_evaluated_and_played_with_their_faults(kind, tmp_path):
     assert not steps.obs[:, 1].any()
 
 
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("flag", [1, 1.0, "yes"])
+def test_a_flag_is_true_or_false(flag):
+    with pytest.raises(UserError, match=r"flicker_flag=.* is impossible: it must be"):
+        tasks.make("pendulum", faults={"flicker_flag": flag})
+
+
 def test_a_seed_of_an_evaluation_is_a_sequence_of_faults():
     task = make("gym:Pendulum-v1", faults=Faults(noise=0.1, flicker=0.3))
 

@@ -1,5 +1,7 @@
 """Gymnasium environments as tasks: observations and actions, supported spaces, and one clear message per fault."""
 
+import dataclasses
+
 import gymnasium
 import numpy as np
 import pytest
@@ -216,6 +218,18 @@ def test_without_the_extra_there_is_the_command_to_install_it(name, extra, monke
         monkeypatch.setitem(__import__("sys").modules, module, None)
     with pytest.raises(UserError, match=rf"pip install 'beliefrl\[{extra}\]'"):
         _ = tasks.make(name).spec
+
+
+def test_a_selection_of_a_selection_is_recorded_as_entries_of_the_full_observation():
+    robot = tasks.make("hopper-v")
+    one = dataclasses.replace(robot, indices=(robot.indices[1],))  # as observe=[1] does
+    assert tasks.describe(one)["task"] == "hopper"
+    assert tasks.describe(one)["observe"] == [4]
+    assert tasks.describe(robot)["task"] == "hopper-v"
+    twice = tasks.observe(tasks.make("pendulum", observe=[2, 0]), (0,))
+    assert tasks.entries(twice) == (2,)
+    recorded = tasks.describe(twice)
+    assert tasks.entries(tasks.make(recorded["task"], observe=recorded["observe"])) == (2,)
 
 
 @pytest.mark.parametrize("known", catalogue.ROBOTS, ids=str)

@@ -52,6 +52,18 @@ def test_a_step_that_takes_too_long_is_a_fault_and_names_the_seed(monkeypatch):
     assert not any(process.is_alive() for process in lanes._envs.processes)
 
 
+def test_a_seed_that_has_diverged_does_not_stop_the_environments_of_the_others():
+    class Echo(Fine):
+        def step(self, action):
+            return np.full(2, action[0], np.float32), 0.0, False, False, {}
+
+    lanes = Lockstep(GymnasiumTask(Echo), ["seed 0", "seed 1"])
+    lanes.reset(np.array([0, 1]))
+    obs = lanes.step(np.array([[np.nan], [0.5]], np.float32)).obs
+    np.testing.assert_array_equal(obs[:, 0], [2.0, 4.0])  # the middle of its bounds, and three quarters
+    lanes.close()
+
+
 def test_a_time_limit_needs_processes(tmp_path):
     agent, task = agents.make("sac-mlp", **SHARED, batch_size=8), GymnasiumTask(Fine)
     for processes in ("auto", "never"):

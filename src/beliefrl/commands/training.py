@@ -62,11 +62,12 @@ def check(argv: Sequence[str]) -> None:
     options = parse(CheckOptions, argv, "beliefrl check")
     from rich.console import Console
 
+    from beliefrl import tasks
     from beliefrl.errors import UserError
     from beliefrl.tasks.check import check as look
 
-    constants = named_values(options.constants, "--constants")
-    found = look(options.task, options.observe or None, options.steps, options.seed, **constants)
+    task = tasks.make(options.task, **named_values(options.constants, "--constants"))
+    found = look(task, options.observe or None, options.steps, options.seed)
     Console().print(found)
     if found.refusals:
         raise UserError(" ".join(found.refusals))

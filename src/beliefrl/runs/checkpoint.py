@@ -12,8 +12,10 @@ Files are plain numbers and JSON: reading them runs no code.
 """
 
 import hashlib
+import itertools
 import json
 import math
+import operator
 import os
 import pathlib
 import re
@@ -41,6 +43,9 @@ class Found(NamedTuple):
     progress: dict[str, Any]
     tree: Any
     timesteps: Any  # numpy, leaves (*rings, capacity, ...)
+    missing: (
+        np.ndarray
+    )  # (*rings,), how many of the first timesteps ever added are in no file; the rings do without them
     passed_over: list[str]  # one sentence for each newer checkpoint, which is damaged
 
 
@@ -119,7 +124,11 @@ class Checkpoints:
         if not found:
             return None
         kept = self.folder / f"kept-for-{name}"
-        shutil.copytree(found[0], kept, copy_function=os.link, dirs_exist_ok=True)
+        temporary = self.folder / f".{kept.name}.tmp"
+        for old in (temporary, kept):  # left by a kill; of an earlier time
+            shutil.rmtree(old, ignore_errors=True)
+        shutil.copytree(found[0], temporary, copy_function=_linked)
+        temporary.rename(kept)
         return kept
 
     def abandon(self) -> None:
@@ -128,8 +137,10 @@ class Checkpoints:
 
     # Writing
 
-    def _new_timesteps(self, timesteps: Any, added: np.ndarray) -> tuple[list[int], list[int], dict[str, np.ndarray]]:
-        """The timesteps that are in no file yet, (ring, new). Rings with fewer new timesteps than others are padded."""
+    def _new_timesteps(
+        self, timesteps: Any, added: np.ndarray
+    ) -> tuple[list[int], list[int], int, dict[str, np.ndarray]]:
+        """Start, stop, capacity and the timesteps that are in no file yet, (ring, new). Shorter rings are padded."""
         capacity = jax.tree.leaves(timesteps)[0].shape[added.ndim]
         stop = [int(number) for number in added.flat]
         written = self._segments[-1].stop if self._segments else [0] * len(stop)
@@ -138,16 +149,19 @@ class Checkpoints:
         index = (np.array(start)[:, None] + np.arange(longest)) % capacity
         rings = (axis[:, None] for axis in np.unravel_index(np.arange(len(stop)), added.shape))
         where = (*rings, index)
-        return start, stop, arrays.copied(jax.tree.map(lambda leaf: _on_host(leaf)[where], timesteps))
+        return start, stop, capacity, arrays.copied(jax.tree.map(lambda leaf: _on_host(leaf)[where], timesteps))
 
     def _write(self, step: int, progress: dict[str, Any], state: dict[str, np.ndarray], new: Any) -> None:
-        start, stop, timesteps = new
+        start, stop, capacity, timesteps = new
         replay = self.folder / "replay"
         replay.mkdir(parents=True, exist_ok=True)
         if stop != (self._segments[-1].stop if self._segments else None):
             path, content = replay / f"{_next_number(replay):06d}.safetensors", arrays.packed(timesteps)
             write_whole(path, content)
             self._segments.append(Segment(path.name, start, stop, len(content), _sha256(content)))
+            oldest = [number - capacity for number in stop]
+            alive = (any(map(operator.gt, segment.stop, oldest)) for segment in self._segments)
+            self._segments = list(itertools.compress(self._segments, alive))
         final = self.folder / f"{_next_number(self.folder):06d}-step-{step}"
         temporary = self.folder / f".{final.name}.tmp"
         for left in self.folder.glob(".*.tmp"):  # left by a process that was killed
@@ -169,7 +183,10 @@ class Checkpoints:
         for path in self._listed()[self.keep :]:
             shutil.rmtree(path)
         kept += self.folder.glob("kept-*")
-        named = {segment["file"] for path in kept for segment in _content(path)["replay"]}
+        try:
+            named = {segment["file"] for path in kept for segment in _content(path)["replay"]}
+        except Damaged:  # nobody knows which files it needs
+            return
         for path in (self.folder / "replay").iterdir():
             if path.name not in named:
                 path.unlink()
@@ -204,8 +221,10 @@ class Checkpoints:
                 continue
             tree = arrays.read(path / "state.safetensors", like, renamed)
             self._segments = [Segment(**segment) for segment in content["replay"]]
-            rings = self._timesteps(timesteps, self._segments, axes)
-            return Found(content["step"], content["progress"], tree, rings, passed_over)
+            rings, missing = self._timesteps(timesteps, self._segments, axes)
+            if missing.any():  # the rings are numbered anew, so the files do not continue them
+                self._segments = []
+            return Found(content["step"], content["progress"], tree, rings, missing, passed_over)
         why = f": {passed_over[0]}" if passed_over else "."
         raise UserError(f"{self.folder.parent} has no checkpoint to continue from{why}")
 
@@ -223,7 +242,16 @@ class Checkpoints:
             _check(self.folder / "replay" / segment["file"], segment["size"], segment["sha256"])
         return content
 
-    def _timesteps(self, like: Any, segments: list[Segment], axes: int) -> Any:
+    def _timesteps(self, like: Any, segments: list[Segment], axes: int) -> tuple[Any, np.ndarray]:
+        """The rings, and how many timesteps each has lost at its beginning.
+
+        A ring that has become larger may ask for timesteps that were overwritten before they were saved. It is numbered
+        from its first saved timestep on.
+        """
+        shape = jax.tree.leaves(like)[0].shape[: axes + 1]
+        begin = np.array(segments[0].start if segments else np.zeros(math.prod(shape[:-1]), int))
+        stop = np.array(segments[-1].stop) if segments else begin
+        missing = np.where((begin > np.maximum(stop - shape[-1], 0)).any(), begin, 0)
         rings = jax.tree.map(
             lambda leaf: np.zeros((math.prod(leaf.shape[:axes]), *leaf.shape[axes:]), leaf.dtype), like
         )
@@ -235,8 +263,9 @@ class Checkpoints:
                 if name not in saved or saved[name].shape[2:] != ring.shape[2:]:
                     raise arrays.misfit(path, name)
                 for number, (start, stop) in enumerate(zip(segment.start, segment.stop, strict=True)):
-                    ring[number, np.arange(start, stop) % ring.shape[1]] = saved[name][number, : stop - start]
-        return jax.tree.map(lambda ring, leaf: ring.reshape(leaf.shape), rings, like)
+                    index = (np.arange(start, stop) - missing[number]) % ring.shape[1]
+                    ring[number, index] = saved[name][number, : stop - start]
+        return jax.tree.map(lambda ring, leaf: ring.reshape(leaf.shape), rings, like), missing.reshape(shape[:-1])
 
 
 def listed(folder: pathlib.Path) -> list[pathlib.Path]:
@@ -252,8 +281,16 @@ def was_ever_written(folder: pathlib.Path) -> bool:
 
 def _next_number(folder: pathlib.Path) -> int:
     """One more than the largest number of a file here, so that no file is ever replaced."""
-    found = (re.search(r"\d{6}", path.name) for path in folder.iterdir())
-    return max((int(number[0]) for number in found if number), default=0) + 1
+    found = (re.match(r"(?:damaged-)?(\d{6})[-.]", path.name) for path in folder.iterdir())
+    return max((int(number[1]) for number in found if number), default=0) + 1
+
+
+def _linked(source: str, target: str) -> None:
+    """A hard link to a file; a copy where the file system has none."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
 
 
 def _on_host(leaf: Any) -> Any:

@@ -89,6 +89,8 @@ def observe(task: Any, indices: tuple[int, ...]) -> Any:
     if isinstance(task, GymnasiumTask):
         seen = range(size) if task.indices is None else task.indices
         return dataclasses.replace(task, indices=tuple(seen[i] for i in indices))
+    if isinstance(task, Observed):  # one selection: `describe` records one
+        return Observed(task.task, tuple(task.indices[i] for i in indices))
     return Observed(task, tuple(indices))
 
 
@@ -291,7 +293,12 @@ def describe(task: Any) -> dict[str, Any]:
 
 
 def _describe_gymnasium(task: GymnasiumTask) -> dict[str, Any]:
-    robot = ROBOTS.get(task.name.removesuffix("-v").removesuffix("-p"))
-    whole = robot is not None and task.indices == {"-v": robot.velocities, "-p": robot.positions}.get(task.name[-2:])
-    observe = None if whole or task.indices is None else list(task.indices)
-    return {"task": task.name, "constants": dict(task.arguments), "observe": observe}
+    base, mask = (task.name[:-2], MASKS[task.name[-2:]]) if task.name[-2:] in MASKS else (task.name, None)
+    constants = dict(task.arguments)
+    if mask is not None and base in ROBOTS:
+        if task.indices == getattr(ROBOTS[base], mask):
+            return {"task": task.name, "constants": constants, "observe": None}
+    else:
+        base = task.name
+    observe = None if task.indices is None else list(task.indices)  # of the full observation, which the base name has
+    return {"task": base, "constants": constants, "observe": observe}

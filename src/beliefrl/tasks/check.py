@@ -1,7 +1,9 @@
 """Check a task before training: its observations, actions and rewards, the reasons to refuse it, and warnings."""
 
+import contextlib
 import dataclasses
 import io
+import numbers
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -12,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from beliefrl import tasks
-from beliefrl.tasks import Observed
+from beliefrl.tasks import Observed, without_faults
 from beliefrl.tasks.environment import TaskEnvironment
 from beliefrl.tasks.gymnasium import ENDLESS, GymnasiumTask
 from beliefrl.tasks.labels import action_names, observation_names
@@ -115,16 +117,15 @@ def check(
         UserError: there is no such task or constant, the environment cannot be made, or a number is out of range.
     """
     for what, value, least in (("steps", steps, 1), ("seed", seed, 0)):
-        if not least <= value <= LARGEST // 2:
+        if not isinstance(value, numbers.Integral) or not least <= value <= LARGEST // 2:
             raise UserError(f"{what}={value} is impossible: it must be a whole number of at least {least}.")
-    name = task if isinstance(task, str) else ""
     whole = tasks.make(task, **constants) if isinstance(task, str) else task
     found = _declared(whole)
     if found.refusals:
         return found
     seen = whole
     try:
-        seen = whole if observe is None else tasks.observed(name, whole, observe)
+        seen = whole if observe is None else tasks.observed(tasks.describe(whole)["task"], whole, observe)
     except UserError as error:  # the tables are still made, to show the existing entries
         found = dataclasses.replace(found, refusals=(str(error),))
     return _played(found, seen, steps, seed)
@@ -147,13 +148,14 @@ def _declared(task: Any) -> TaskCheck:
         bounds, wanted = flat_bounds(space), flat_bounds(actions)
         names = observation_names(environment, space, task.name), action_names(environment, wanted.low.size)
         found = dataclasses.replace(found, entries=_entries(names[0], bounds), actions=_entries(names[1], wanted))
-    if hasattr(environment, "close"):
+    with contextlib.suppress(Exception):
         environment.close()
     return dataclasses.replace(found, refusals=refusals)
 
 
 def _unmasked(task: Any) -> Any:
-    return _unmasked(task.task) if isinstance(task, Observed) else task
+    task = without_faults(task)
+    return task.task if isinstance(task, Observed) else task
 
 
 def _entries(names: Sequence[str], bounds: Any) -> tuple[Entry, ...]:
@@ -183,17 +185,18 @@ def _played(found: TaskCheck, task: Any, steps: int, seed: int) -> TaskCheck:
         for _ in range(steps):
             if length == 0:
                 obs, _ = environment.reset(seed=seed + len(ends))
-                observations.append(environment.whole if on_host else obs)
+                observations.append(environment.whole.copy() if on_host else obs)
             started = time.perf_counter()
             obs, reward, *end, _ = environment.step(random.uniform(-1.0, 1.0, len(found.actions)))
             times.append(time.perf_counter() - started)
-            observations.append(environment.whole if on_host else obs)
+            observations.append(environment.whole.copy() if on_host else obs)
             rewards.append(float(reward))
             length = 0 if any(end) or length + 1 == limit else length + 1
             ends += [] if length else [end]
     except UserError as error:
         refusals.append(str(error))
-    environment.close()
+    with contextlib.suppress(Exception):
+        environment.close()
     values = np.array(observations, np.float64).reshape(-1, len(found.entries))
     seen = () if found.refusals else tasks.entries(task)
     entries = _with_values(found.entries, values, seen)

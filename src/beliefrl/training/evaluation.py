@@ -1,6 +1,7 @@
 """Returns of trained agents over episodes and seeds, with sampled and with mode actions."""
 
 import contextlib
+import numbers
 import os
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -175,10 +176,10 @@ def evaluate(
     Raises:
         UserError: there is no such run, nothing was saved in it, or a number is impossible.
     """
-    if not 1 <= episodes <= MOST_EPISODES:
-        raise UserError(f"episodes={episodes} is impossible: it must be from 1 to {MOST_EPISODES}.")
-    if not 0 <= seed <= LARGEST:
-        raise UserError(f"seed={seed} is impossible: it must be from 0 to {LARGEST}.")
+    if not isinstance(episodes, numbers.Integral) or not 1 <= episodes <= MOST_EPISODES:
+        raise UserError(f"episodes={episodes} is impossible: it must be a whole number from 1 to {MOST_EPISODES}.")
+    if not isinstance(seed, numbers.Integral) or not 0 <= seed <= LARGEST:
+        raise UserError(f"seed={seed} is impossible: it must be a whole number from 0 to {LARGEST}.")
     run = run if isinstance(run, Run) else Run(run)
     trained, found, states, precision = restore(run, task, agent, best)
     keep_compiled()

@@ -91,8 +91,9 @@ class Lockstep:
             return self._envs.reset(seed=[int(seed) for seed in seeds])[0]
 
     def step(self, actions: Float[np.ndarray, "lane action"]) -> StepResults:
-        """Step every environment."""
+        """Step every environment. Actions that are not finite, of seeds that have diverged, become zeros."""
         self.steps += 1
+        actions = np.where(np.isfinite(actions), actions, np.float32(0))
         with self._calling("step"):
             if self.apart:
                 self._envs.step_async(actions)

@@ -81,7 +81,7 @@ class Session:
             raise
         except OSError as error:
             raise UserError(
-                f"{self.recorder.folder} cannot be written ({error.strerror}): fix that, then "
+                f"{self.recorder.folder} cannot be written ({error.strerror or error}): fix that, then "
                 f"`beliefrl resume {as_argument(self.recorder)}` goes on."
             ) from None
         return self.recorder
@@ -125,7 +125,9 @@ class Session:
             notes = [f"this training is finished: it {self.ended}; {go_on}, with None to its last step"]
         for note in notes:
             self._report(Event(Phase.RESUMING, found.step, note=note))
-        seeds = found.tree._replace(replay=found.tree.replay._replace(timesteps=found.timesteps))
+        saved = found.tree.replay
+        replay = saved._replace(timesteps=found.timesteps, added=saved.added - found.missing.astype(saved.added.dtype))
+        seeds = found.tree._replace(replay=replay)
         return Snapshot(self.last, jax.tree.map(jnp.asarray, seeds))
 
     def _listen(self, event: Event) -> bool:

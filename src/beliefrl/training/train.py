@@ -214,7 +214,8 @@ def _check_same(run: Run, config: dict[str, Any]) -> None:
     asked = {name: config.get(name) for name in ("agent", "task", "constants", "observe", "faults")}
     asked = asked | config["options"] | config["hyperparameters"]
     asked = json.loads(json.dumps(asked, default=str))  # tuples are lists in the run's config
-    there = {"faults": None} | run.config | run.config["options"] | run.config["hyperparameters"]
+    before = {"faults": None} | dataclasses.asdict(Options())  # what an older version did not record, it did not have
+    there = before | run.config | run.config["options"] | run.config["hyperparameters"]
     there |= {name: asked[name] for name in CHANGEABLE}
     for name, value in asked.items():
         if there.get(name, value) != value:
