@@ -220,6 +220,14 @@ def test_without_the_extra_there_is_the_command_to_install_it(name, extra, monke
         _ = tasks.make(name).spec
 
 
+def test_an_environment_of_ones_own_is_never_recorded_as_one_of_our_tasks():
+    def pendulum():
+        return Fine()
+
+    pendulum.__qualname__ = "pendulum"
+    assert not tasks.knows(tasks.describe(GymnasiumTask(pendulum))["task"])
+
+
 def test_a_selection_of_a_selection_is_recorded_as_entries_of_the_full_observation():
     robot = tasks.make("hopper-v")
     one = dataclasses.replace(robot, indices=(robot.indices[1],))  # as observe=[1] does

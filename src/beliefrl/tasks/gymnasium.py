@@ -13,6 +13,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from beliefrl.catalogue import our_task_names
 from beliefrl.tasks.faults import NONE, STREAM, Draws, Faults
 from beliefrl.tasks.labels import observation_names
 from beliefrl.tasks.spaces import check_actions, flat_bounds, flat_size, limits
@@ -53,7 +54,10 @@ class GymnasiumTask:
         if self.max_steps is not None:
             check_range(self, ("max_steps",), 1)
         if not self.name:
-            object.__setattr__(self, "name", getattr(self.make, "__qualname__", type(self.make).__name__))
+            name = getattr(self.make, "__qualname__", type(self.make).__name__)
+            if name in our_task_names():  # a run would be opened with that task
+                name = f"{self.make.__module__}:{name}"
+            object.__setattr__(self, "name", name)
 
     @cached_property
     def spec(self) -> Spec:

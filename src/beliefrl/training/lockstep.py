@@ -77,13 +77,17 @@ class Lockstep:
         if notify is not None:
             threading.Thread(target=self._watch, args=(notify,), daemon=True).start()
         factories = [_Factory(task, lane) for lane in lanes]
-        with self._calling("gymnasium.make"):
-            self.apart = processes == "always" or (processes == "auto" and _pays(task, len(lanes)))
-            if self.apart:
-                # Forking a process in which JAX runs threads may never return.
-                self._envs = AsyncVectorEnv(factories, context="spawn", autoreset_mode=AutoresetMode.DISABLED)
-            else:
-                self._envs = SyncVectorEnv(factories, autoreset_mode=AutoresetMode.DISABLED)
+        try:
+            with self._calling("gymnasium.make"):
+                self.apart = processes == "always" or (processes == "auto" and _pays(task, len(lanes)))
+                if self.apart:
+                    # Forking a process in which JAX runs threads may never return.
+                    self._envs = AsyncVectorEnv(factories, context="spawn", autoreset_mode=AutoresetMode.DISABLED)
+                else:
+                    self._envs = SyncVectorEnv(factories, autoreset_mode=AutoresetMode.DISABLED)
+        except BaseException:
+            self._closed.set()  # nothing is under way that could be slow
+            raise
 
     def reset(self, seeds: Int[np.ndarray, " lane"]) -> Any:
         """Begin an episode in every environment; returns the observations, (lane, obs)."""
