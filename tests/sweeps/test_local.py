@@ -64,8 +64,17 @@ def test_there_is_a_slot_for_each_core_and_no_more_than_asked_for(monkeypatch):
     assert local.slots(2) == ["1", "2"]
     assert local.slots(4) == ["1", "2", "3", "any"]
     monkeypatch.setattr(local, "_gpus", lambda: 2)
-    assert local.slots() == ["gpu0", "gpu1"]
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    assert local.slots() == local.slots(3) == ["gpu0", "gpu1"]
     assert local.slots(1) == ["gpu0"]
+
+
+def test_trainings_run_only_on_the_gpus_that_the_sweep_may_use(tmp_path, monkeypatch):
+    monkeypatch.setattr(local, "_gpus", lambda: 2)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2, GPU-8f1c")
+    used = [local.environment(tmp_path, slot)["CUDA_VISIBLE_DEVICES"] for slot in local.slots()]
+    assert used == ["2", "GPU-8f1c"]
+    assert local.slots(1) == ["gpu2"]
 
 
 def test_a_training_has_one_thread_on_a_core_and_one_gpu_on_a_gpu(tmp_path, monkeypatch):

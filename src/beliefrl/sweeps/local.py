@@ -10,7 +10,7 @@ from typing import IO
 
 from beliefrl.sweeps.plan import Training
 
-Slot = str  # a core's number, "gpu0" for a GPU, "any" for any one core, or "-" for all cores
+Slot = str  # a core's number, "gpu" and a GPU's name in CUDA_VISIBLE_DEVICES, "any" for any one core, or "-" for all
 
 
 class Local:
@@ -86,7 +86,9 @@ def slots(workers: int | None = None) -> list[Slot]:
     """
     gpus = _gpus()
     if gpus:
-        return [f"gpu{index}" for index in range(min(workers or gpus, gpus))]
+        visible = os.environ.get("CUDA_VISIBLE_DEVICES")  # on a shared machine the other GPUs are not ours
+        names = visible.split(",") if visible else [str(index) for index in range(gpus)]
+        return [f"gpu{name.strip()}" for name in names[:gpus]][:workers]
     if hasattr(os, "sched_getaffinity"):
         cores = [str(core) for core in sorted(os.sched_getaffinity(0))]
     else:
