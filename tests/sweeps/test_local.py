@@ -226,8 +226,19 @@ def test_one_training_can_be_stopped_alone(tmp_path):
     launcher = local.Local(tmp_path, [])
     programs = {name: subprocess.Popen(["sleep", "60"]) for name in ("one", "other")}
     for name, program in programs.items():
-        launcher._running[name] = program, "any", (tmp_path / name).open("wb")
+        launcher._running[name] = program, "any"
     launcher.interrupt("one")
     programs["one"].wait(timeout=30)
     assert launcher.ended() == {"one": -signal.SIGTERM}
     launcher.stop()
+    assert launcher.ended() == {"other": -signal.SIGTERM}
+
+
+def test_trainings_that_finish_while_all_are_stopped_have_their_exit_codes(tmp_path):
+    launcher = local.Local(tmp_path, [])
+    code = "import signal, sys; signal.signal(15, lambda *_: sys.exit(0)); print(flush=True); signal.pause()"
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as program:
+        assert program.stdout.readline()  # from now on it finishes at SIGTERM
+        launcher._running["one"] = program, "any"
+        launcher.stop()
+    assert (launcher.ended(), launcher.room) == ({"one": 0}, 1)

@@ -179,6 +179,24 @@ def test_a_stopped_trial_continues_with_its_settings(search, monkeypatch):
     assert [trial.state for trial in tuned.trials] == ["complete"] * 3
 
 
+def test_trials_that_finish_while_they_are_stopped_count_as_done(search, monkeypatch):
+    loop = tuning._Loop.step
+
+    def interrupted(self):
+        loop(self)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    def finish_all(self):
+        for training, _ in self.running.values():
+            while self.evaluate(training) < training.steps - EVERY:
+                pass
+
+    monkeypatch.setattr(tuning._Loop, "step", interrupted)
+    monkeypatch.setattr(Fake, "stop", finish_all)
+    with pytest.raises(Stopped, match="stopped with 2 of 3 trials done in"):
+        search(3, workers=2)
+
+
 def test_a_poor_trial_is_pruned_unless_pruning_is_off(search, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(study, "STARTUP", 1)
     tuned = search(3)

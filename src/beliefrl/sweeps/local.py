@@ -6,7 +6,6 @@ import platform
 import signal
 import subprocess
 import sys
-from typing import IO
 
 from beliefrl.sweeps.plan import Training
 
@@ -19,7 +18,7 @@ class Local:
     def __init__(self, sweep: pathlib.Path, slots: list[Slot]):
         """`slots` are the places where trainings run, one training at a time in each."""
         self.sweep, self.free = sweep, list(slots)
-        self._running: dict[str, tuple[subprocess.Popen[bytes], Slot, IO[bytes]]] = {}
+        self._running: dict[str, tuple[subprocess.Popen[bytes], Slot]] = {}
 
     @property
     def room(self) -> int:
@@ -29,26 +28,23 @@ class Local:
     def start(self, training: Training) -> None:
         """Start a training in a free slot."""
         slot = self.free.pop(0)
-        log = (self.sweep / "logs" / f"{training.name}.log").open("ab")
         core = slot if slot.isdigit() else "-"
         command = [sys.executable, "-m", "beliefrl.worker", core, *training.command(self.sweep)]
-        process = subprocess.Popen(
-            command,
-            env=environment(self.sweep, slot),
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            start_new_session=True,  # Ctrl-C goes only to the sweep, which stops its trainings
-        )
-        self._running[training.name] = (process, slot, log)
+        with (self.sweep / "logs" / f"{training.name}.log").open("ab") as log:
+            process = subprocess.Popen(
+                command,
+                env=environment(self.sweep, slot),
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,  # Ctrl-C goes only to the sweep, which stops its trainings
+            )
+        self._running[training.name] = (process, slot)
 
     def ended(self) -> dict[str, int]:
         """The exit codes of the trainings that have ended since the last call."""
-        codes = {name: code for name, (process, *_) in self._running.items() if (code := process.poll()) is not None}
-        for name in codes:
-            _, slot, log = self._running.pop(name)
-            log.close()
-            self.free.append(slot)
+        codes = {name: code for name, (process, _) in self._running.items() if (code := process.poll()) is not None}
+        self.free += [self._running.pop(name)[1] for name in codes]
         return codes
 
     def interrupt(self, name: str) -> None:
@@ -56,12 +52,11 @@ class Local:
         self._running[name][0].send_signal(signal.SIGTERM)
 
     def stop(self) -> None:
-        """Ask every training to write a checkpoint and stop, and wait for them."""
-        for process, *_ in self._running.values():
+        """Ask every training to write a checkpoint and stop, and wait for them. `ended` has their exit codes."""
+        for process, _ in self._running.values():
             process.send_signal(signal.SIGTERM)
-        for process, *_ in self._running.values():
+        for process, _ in self._running.values():
             process.wait()
-        self.ended()
 
 
 def environment(sweep: pathlib.Path, slot: Slot) -> dict[str, str]:
