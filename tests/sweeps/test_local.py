@@ -49,6 +49,18 @@ def test_a_training_that_fails_frees_its_core_and_says_why(tmp_path):
     assert "no agent 'vmr'" in reason(tmp_path / "logs" / "wrong.log", 2)
 
 
+def test_the_reason_of_a_failure_is_not_that_of_an_earlier_session(tmp_path):
+    path = tmp_path / "log"
+    for said in ("beliefrl: stopped at step 10\n", ""):
+        with local.open_log(path) as log:
+            log.write(said.encode())
+    assert "stopped at step 10" in path.read_text()
+    assert reason(path, -9) == "it ended with code -9 and printed nothing"
+    with local.open_log(path) as log:
+        log.write(b"Traceback\nValueError: odd\n")
+    assert reason(path, 1) == "ValueError: odd"
+
+
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="This system cannot choose cores.")
 def test_a_worker_runs_on_its_core():
     core = max(os.sched_getaffinity(0))

@@ -6,10 +6,13 @@ import platform
 import signal
 import subprocess
 import sys
+from typing import IO
 
 from beliefrl.sweeps.plan import Training
 
 Slot = str  # a core's number, "gpu" and a GPU's name in CUDA_VISIBLE_DEVICES, "any" for any one core, or "-" for all
+
+BEGIN = "==== a training begins ====\n"  # separates sessions in a log
 
 
 class Local:
@@ -30,7 +33,7 @@ class Local:
         slot = self.free.pop(0)
         core = slot if slot.isdigit() else "-"
         command = [sys.executable, "-m", "beliefrl.worker", core, *training.command(self.sweep)]
-        with (self.sweep / "logs" / f"{training.name}.log").open("ab") as log:
+        with open_log(self.sweep / "logs" / f"{training.name}.log") as log:
             process = subprocess.Popen(
                 command,
                 env=environment(self.sweep, slot),
@@ -57,6 +60,13 @@ class Local:
             process.send_signal(signal.SIGTERM)
         for process, _ in self._running.values():
             process.wait()
+
+
+def open_log(path: pathlib.Path) -> IO[bytes]:
+    """The log of a training that is about to begin. What earlier sessions have written stays in it."""
+    log = path.open("ab", buffering=0)
+    log.write(BEGIN.encode())
+    return log
 
 
 def environment(sweep: pathlib.Path, slot: Slot) -> dict[str, str]:

@@ -137,8 +137,9 @@ def _loop(folder: pathlib.Path, status: SweepStatus, launcher: Launcher, report:
 
 
 def reason(log: pathlib.Path, code: int) -> str:
-    """Why a training failed: its last error message, or else the last line of its output."""
-    lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    """Why a training failed: its last error message, or else the last line of its output, in this session."""
+    _, _, output = log.read_text(errors="replace").rpartition(local.BEGIN)
+    lines = [line.strip() for line in output.splitlines() if line.strip()]
     messages = [line.removeprefix("beliefrl: ") for line in lines if line.startswith("beliefrl: ")] or lines
     return messages[-1] if messages else f"it ended with code {code} and printed nothing"
 
