@@ -179,6 +179,22 @@ def test_a_stopped_trial_continues_with_its_settings(search, monkeypatch):
     assert [trial.state for trial in tuned.trials] == ["complete"] * 3
 
 
+def test_a_trial_that_is_stopped_from_outside_continues_at_once(search, monkeypatch):
+    start = Fake.start
+
+    def stopped_once(self, training):
+        start(self, training)
+        if [each.name for each in Fake.started].count(training.name) == 1:
+            self.interrupt(training.name)
+
+    monkeypatch.setattr(Fake, "start", stopped_once)
+    tuned = search(3, workers=2)
+    assert sorted(each.name for each in Fake.started) == [f"trial-00{number}" for number in (0, 0, 1, 1, 2, 2)]
+    assert [trial.state for trial in tuned.trials] == ["complete"] * 3
+    rates = {(each.name, each.settings["lr_actor"]) for each in Fake.started}
+    assert rates == {(trial.name, trial.settings["lr_actor"]) for trial in tuned.trials}
+
+
 def test_trials_that_finish_while_they_are_stopped_count_as_done(search, monkeypatch):
     loop = tuning._Loop.step
 
