@@ -264,6 +264,15 @@ def test_a_study_of_something_else_is_not_continued(search, tmp_path):
         search(2)
 
 
+def test_a_study_continues_where_entries_are_given_as_numbers_or_as_text(search, tmp_path):
+    search(1, observe=(0,))
+    assert len(search(1, observe=("0",)).trials) == 1
+    journal = tmp_path / "search" / study.JOURNAL
+    journal.write_text(journal.read_text().replace('"observe":["0"]', '"observe":[0]'))  # as older studies have it
+    assert '"observe":[0]' in journal.read_text()
+    assert len(search(1, observe=("0",)).trials) == 1
+
+
 def test_a_full_disk_is_one_sentence_and_the_search_goes_on_later(search, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
