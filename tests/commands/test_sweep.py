@@ -3,7 +3,7 @@
 import pytest
 
 from beliefrl import cli
-from beliefrl.sweeps import run
+from beliefrl.sweeps import presets, run
 from written import a_run, flat
 
 
@@ -69,6 +69,23 @@ def test_a_file_and_the_command_line_go_together(asked, tmp_path):
     assert (len(made.seeds), made.settings) == (9, {"gamma": 0.9, "steps": 40})
     (made,) = experiments(asked, "mine.py --seeds 2")
     assert len(made.seeds) == 2
+
+
+def test_the_first_seed_can_be_given_alone(asked, tmp_path):
+    for preset, count in (("memory", 5), ("scalability", 1)):
+        made = experiments(asked, f"--preset {preset} --seed 7")
+        assert {tuple(each.seeds) for each in made} == {tuple(range(7, 7 + count))}
+    usual, *other = experiments(asked, "--preset sensitivity --tasks pendulum --seed 3")
+    assert usual.seeds == tuple(range(3, 23))
+    for each in other:  # the settings are still those that are drawn for the seed
+        assert presets.drawn(each.seeds[0]).items() <= each.settings.items()
+    lines = (
+        "import beliefrl",
+        "experiments = [beliefrl.Experiment('vrm', 'pendulum', seeds=s) for s in ([4, 2], [3])]",
+    )
+    (tmp_path / "mine.py").write_text("\n".join(lines))
+    for line, seeds in (("", [[4, 2], [3]]), ("--seed 0", [[2, 0], [1]]), ("--seed 9 --seeds 2", [[9, 10], [9, 10]])):
+        assert [list(each.seeds) for each in experiments(asked, f"mine.py {line}")] == seeds
 
 
 @pytest.mark.parametrize("kind", ["curves", "ablation", "aggregate"])

@@ -49,6 +49,18 @@ def test_a_training_that_fails_frees_its_core_and_says_why(tmp_path):
     assert "no agent 'vmr'" in reason(tmp_path / "logs" / "wrong.log", 2)
 
 
+def test_the_reason_of_a_failure_is_not_that_of_an_earlier_session(tmp_path):
+    path = tmp_path / "log"
+    for said in ("beliefrl: stopped at step 10\n", ""):
+        with local.open_log(path) as log:
+            log.write(said.encode())
+    assert "stopped at step 10" in path.read_text()
+    assert reason(path, -9) == "it ended with code -9 and printed nothing"
+    with local.open_log(path) as log:
+        log.write(b"Traceback\nValueError: odd\n")
+    assert reason(path, 1) == "ValueError: odd"
+
+
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="This system cannot choose cores.")
 def test_a_worker_runs_on_its_core():
     core = max(os.sched_getaffinity(0))
@@ -64,8 +76,17 @@ def test_there_is_a_slot_for_each_core_and_no_more_than_asked_for(monkeypatch):
     assert local.slots(2) == ["1", "2"]
     assert local.slots(4) == ["1", "2", "3", "any"]
     monkeypatch.setattr(local, "_gpus", lambda: 2)
-    assert local.slots() == ["gpu0", "gpu1"]
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    assert local.slots() == local.slots(3) == ["gpu0", "gpu1"]
     assert local.slots(1) == ["gpu0"]
+
+
+def test_trainings_run_only_on_the_gpus_that_the_sweep_may_use(tmp_path, monkeypatch):
+    monkeypatch.setattr(local, "_gpus", lambda: 2)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2, GPU-8f1c")
+    used = [local.environment(tmp_path, slot)["CUDA_VISIBLE_DEVICES"] for slot in local.slots()]
+    assert used == ["2", "GPU-8f1c"]
+    assert local.slots(1) == ["gpu2"]
 
 
 def test_a_training_has_one_thread_on_a_core_and_one_gpu_on_a_gpu(tmp_path, monkeypatch):
@@ -217,8 +238,19 @@ def test_one_training_can_be_stopped_alone(tmp_path):
     launcher = local.Local(tmp_path, [])
     programs = {name: subprocess.Popen(["sleep", "60"]) for name in ("one", "other")}
     for name, program in programs.items():
-        launcher._running[name] = program, "any", (tmp_path / name).open("wb")
+        launcher._running[name] = program, "any"
     launcher.interrupt("one")
     programs["one"].wait(timeout=30)
     assert launcher.ended() == {"one": -signal.SIGTERM}
     launcher.stop()
+    assert launcher.ended() == {"other": -signal.SIGTERM}
+
+
+def test_trainings_that_finish_while_all_are_stopped_have_their_exit_codes(tmp_path):
+    launcher = local.Local(tmp_path, [])
+    code = "import signal, sys; signal.signal(15, lambda *_: sys.exit(0)); print(flush=True); signal.pause()"
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as program:
+        assert program.stdout.readline()  # from now on it finishes at SIGTERM
+        launcher._running["one"] = program, "any"
+        launcher.stop()
+    assert (launcher.ended(), launcher.room) == ({"one": 0}, 1)

@@ -93,6 +93,22 @@ def test_a_sweep_that_grows_trains_no_seed_twice():
     assert extended(before, []) == before
 
 
+def test_entries_are_the_same_as_numbers_and_as_text(tmp_path):
+    number, text = (Experiment("vrm", "pendulum", seeds=(0,), observe=observe) for observe in ((0,), ("0",)))
+    assert plan([number]) == plan([text]) == extended(plan([number]), [text])
+    write(tmp_path, plan([number]))
+    path = tmp_path / "sweep.json"
+    path.write_text(path.read_text().replace('"0"', "0"))  # as older sweeps have it
+    assert extended(read(tmp_path), [text]) == plan([text])
+
+
+def test_a_sweep_has_no_two_trainings_of_one_name():
+    one, other = (Experiment("vrm", "pendulum-v", {"noise": noise}, (0,)) for noise in (0.1, [0.1]))
+    for planned in (lambda: plan([one, other]), lambda: extended(plan([one]), [other])):
+        with pytest.raises(UserError, match=r"training.* vrm-pendulum-v-noise=0\.1-seed0"):
+            planned()
+
+
 def test_a_training_is_a_command_that_says_everything(tmp_path):
     experiment = Experiment(
         "vrm",

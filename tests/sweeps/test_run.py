@@ -133,6 +133,18 @@ def test_trainings_that_finish_while_they_are_stopped_count_as_finished(tmp_path
         sweep(TWO, tmp_path, workers=2, report=lambda status: os.kill(os.getpid(), signal.SIGINT))
 
 
+def test_a_sweep_that_cannot_be_planned_closes_its_launcher(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    closed = []
+    monkeypatch.setattr(runs.files, "write", full)
+    monkeypatch.setattr(Pretence, "stop", lambda self: closed.append(self))
+    with pytest.raises(OSError, match="No space left"):
+        sweep(TWO, tmp_path)
+    assert len(closed) == 1
+
+
 def test_two_processes_cannot_run_one_sweep(tmp_path):
     def again(status):
         with pytest.raises(UserError, match="is in use by process"):

@@ -179,6 +179,40 @@ def test_a_stopped_trial_continues_with_its_settings(search, monkeypatch):
     assert [trial.state for trial in tuned.trials] == ["complete"] * 3
 
 
+def test_a_trial_that_is_stopped_from_outside_continues_at_once(search, monkeypatch):
+    start = Fake.start
+
+    def stopped_once(self, training):
+        start(self, training)
+        if [each.name for each in Fake.started].count(training.name) == 1:
+            self.interrupt(training.name)
+
+    monkeypatch.setattr(Fake, "start", stopped_once)
+    tuned = search(3, workers=2)
+    assert sorted(each.name for each in Fake.started) == [f"trial-00{number}" for number in (0, 0, 1, 1, 2, 2)]
+    assert [trial.state for trial in tuned.trials] == ["complete"] * 3
+    rates = {(each.name, each.settings["lr_actor"]) for each in Fake.started}
+    assert rates == {(trial.name, trial.settings["lr_actor"]) for trial in tuned.trials}
+
+
+def test_trials_that_finish_while_they_are_stopped_count_as_done(search, monkeypatch):
+    loop = tuning._Loop.step
+
+    def interrupted(self):
+        loop(self)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    def finish_all(self):
+        for training, _ in self.running.values():
+            while self.evaluate(training) < training.steps - EVERY:
+                pass
+
+    monkeypatch.setattr(tuning._Loop, "step", interrupted)
+    monkeypatch.setattr(Fake, "stop", finish_all)
+    with pytest.raises(Stopped, match="stopped with 2 of 3 trials done in"):
+        search(3, workers=2)
+
+
 def test_a_poor_trial_is_pruned_unless_pruning_is_off(search, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(study, "STARTUP", 1)
     tuned = search(3)
@@ -228,6 +262,15 @@ def test_a_study_of_something_else_is_not_continued(search, tmp_path):
     journal.write_text("nonsense\n" + journal.read_text())
     with pytest.raises(UserError, match=r"study\.journal is damaged"):
         search(2)
+
+
+def test_a_study_continues_where_entries_are_given_as_numbers_or_as_text(search, tmp_path):
+    search(1, observe=(0,))
+    assert len(search(1, observe=("0",)).trials) == 1
+    journal = tmp_path / "search" / study.JOURNAL
+    journal.write_text(journal.read_text().replace('"observe":["0"]', '"observe":[0]'))  # as older studies have it
+    assert '"observe":[0]' in journal.read_text()
+    assert len(search(1, observe=("0",)).trials) == 1
 
 
 def test_a_full_disk_is_one_sentence_and_the_search_goes_on_later(search, monkeypatch):

@@ -28,8 +28,9 @@ class SweepOptions:
     """Names of the tasks."""
     seeds: int | None = None
     """Number of seeds per experiment, starting at --seed. None: as in the paper (5; sensitivity 20), 2 with --scale."""
-    seed: int = 0
-    """Number of the first seed."""
+    seed: int | None = None
+    """Number of the first seed. Without --seeds, the numbers of all seeds are shifted so that the lowest is this one.
+    None: 0, or as FILE has them."""
     steps: int | None = None
     """Environment steps per seed. None: those of the preset, or 20,000."""
     set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE[,VALUE...]")] = ()
@@ -79,18 +80,21 @@ def _experiments(options: SweepOptions) -> list:
     for name in ("seeds", "steps", "workers", "seeds_per_run"):
         if getattr(options, name) is not None and getattr(options, name) < 1:
             raise UsageError(f"{name}={getattr(options, name)} is impossible: it must be a whole number of at least 1.")
-    Options(seed=options.seed, seeds=options.seeds or 1)
-    count = options.seeds or (2 if options.scale < 1 else None)
-    numbers = None if count is None else range(options.seed, options.seed + count)
+    first, count = options.seed or 0, options.seeds or (2 if options.scale < 1 else None)
+    Options(seed=first, seeds=count or 1)
     if options.file is not None:
         if options.preset or options.agents or options.tasks:
             raise UsageError("FILE defines the agents and tasks: leave --preset, --agents and --tasks out.")
         chosen = files.load(options.file)
-        chosen = [dataclasses.replace(each, seeds=tuple(numbers)) for each in chosen] if numbers else chosen
+        if count is not None:
+            chosen = [dataclasses.replace(each, seeds=tuple(range(first, first + count))) for each in chosen]
+        elif options.seed is not None:
+            chosen = _shifted(chosen, first)
     elif options.preset is not None:
+        numbers = range(first, first + (count or presets.PRESETS[options.preset].seeds))
         chosen = presets.preset(options.preset, options.tasks, options.agents, numbers)
     elif options.agents and options.tasks:
-        chosen = plan.grid(options.agents, options.tasks, seeds=numbers or range(options.seed, options.seed + 5))
+        chosen = plan.grid(options.agents, options.tasks, seeds=range(first, first + (count or 5)))
     elif options.out is not None and _only_continues(options) and files.read(options.out):
         return []
     else:
@@ -105,6 +109,12 @@ def _only_continues(options: SweepOptions) -> bool:
     """Whether the options only say which sweep to continue, and on which machines or cores."""
     where = dataclasses.replace(SweepOptions(), out=options.out, workers=options.workers, ray=options.ray)
     return options == dataclasses.replace(where, seeds_per_run=options.seeds_per_run)
+
+
+def _shifted(experiments: list, first: int) -> list:
+    """The experiments with the same distance added to the numbers of all seeds, so that the lowest is `first`."""
+    distance = first - min((seed for each in experiments for seed in each.seeds), default=first)
+    return [dataclasses.replace(each, seeds=tuple(seed + distance for seed in each.seeds)) for each in experiments]
 
 
 def _with_settings(experiments: list, options: SweepOptions) -> list:

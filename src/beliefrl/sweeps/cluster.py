@@ -14,7 +14,7 @@ import time
 from typing import Any
 
 from beliefrl.sweeps.files import PLAN
-from beliefrl.sweeps.local import environment
+from beliefrl.sweeps.local import environment, open_log
 from beliefrl.sweeps.plan import Training
 from beliefrl.types import UserError
 
@@ -98,7 +98,7 @@ def train_on_node(sweep: str, log: str, command: list[str], on_gpu: bool) -> int
     if not (pathlib.Path(sweep) / PLAN).exists():
         raise FileNotFoundError(f"{socket.gethostname()} does not see {sweep}: the folder must be on all machines.")
     slot = f"gpu{os.environ.get('CUDA_VISIBLE_DEVICES', '0')}" if on_gpu else "any"
-    with pathlib.Path(log).open("ab") as out:
+    with open_log(pathlib.Path(log)) as out:
         process = subprocess.Popen(
             [sys.executable, "-m", "beliefrl.worker", "-", *command],
             env=environment(pathlib.Path(sweep), slot),

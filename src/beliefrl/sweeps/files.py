@@ -50,7 +50,7 @@ def read(sweep: pathlib.Path) -> list[Training]:
     path = sweep / PLAN
     try:
         written = json.loads(path.read_text())["trainings"]
-        return [Training(**{**each, "observe": tuple(each["observe"])}) for each in written]
+        return [Training(**{**each, "observe": tuple(map(str, each["observe"]))}) for each in written]
     except FileNotFoundError:
         return []
     except (OSError, ValueError, KeyError, TypeError):

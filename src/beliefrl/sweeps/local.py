@@ -10,7 +10,9 @@ from typing import IO
 
 from beliefrl.sweeps.plan import Training
 
-Slot = str  # a core's number, "gpu0" for a GPU, "any" for any one core, or "-" for all cores
+Slot = str  # a core's number, "gpu" and a GPU's name in CUDA_VISIBLE_DEVICES, "any" for any one core, or "-" for all
+
+BEGIN = "==== a training begins ====\n"  # separates sessions in a log
 
 
 class Local:
@@ -19,7 +21,7 @@ class Local:
     def __init__(self, sweep: pathlib.Path, slots: list[Slot]):
         """`slots` are the places where trainings run, one training at a time in each."""
         self.sweep, self.free = sweep, list(slots)
-        self._running: dict[str, tuple[subprocess.Popen[bytes], Slot, IO[bytes]]] = {}
+        self._running: dict[str, tuple[subprocess.Popen[bytes], Slot]] = {}
 
     @property
     def room(self) -> int:
@@ -29,26 +31,23 @@ class Local:
     def start(self, training: Training) -> None:
         """Start a training in a free slot."""
         slot = self.free.pop(0)
-        log = (self.sweep / "logs" / f"{training.name}.log").open("ab")
         core = slot if slot.isdigit() else "-"
         command = [sys.executable, "-m", "beliefrl.worker", core, *training.command(self.sweep)]
-        process = subprocess.Popen(
-            command,
-            env=environment(self.sweep, slot),
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            start_new_session=True,  # Ctrl-C goes only to the sweep, which stops its trainings
-        )
-        self._running[training.name] = (process, slot, log)
+        with open_log(self.sweep / "logs" / f"{training.name}.log") as log:
+            process = subprocess.Popen(
+                command,
+                env=environment(self.sweep, slot),
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,  # Ctrl-C goes only to the sweep, which stops its trainings
+            )
+        self._running[training.name] = (process, slot)
 
     def ended(self) -> dict[str, int]:
         """The exit codes of the trainings that have ended since the last call."""
-        codes = {name: code for name, (process, *_) in self._running.items() if (code := process.poll()) is not None}
-        for name in codes:
-            _, slot, log = self._running.pop(name)
-            log.close()
-            self.free.append(slot)
+        codes = {name: code for name, (process, _) in self._running.items() if (code := process.poll()) is not None}
+        self.free += [self._running.pop(name)[1] for name in codes]
         return codes
 
     def interrupt(self, name: str) -> None:
@@ -56,12 +55,18 @@ class Local:
         self._running[name][0].send_signal(signal.SIGTERM)
 
     def stop(self) -> None:
-        """Ask every training to write a checkpoint and stop, and wait for them."""
-        for process, *_ in self._running.values():
+        """Ask every training to write a checkpoint and stop, and wait for them. `ended` has their exit codes."""
+        for process, _ in self._running.values():
             process.send_signal(signal.SIGTERM)
-        for process, *_ in self._running.values():
+        for process, _ in self._running.values():
             process.wait()
-        self.ended()
+
+
+def open_log(path: pathlib.Path) -> IO[bytes]:
+    """The log of a training that is about to begin. What earlier sessions have written stays in it."""
+    log = path.open("ab", buffering=0)
+    log.write(BEGIN.encode())
+    return log
 
 
 def environment(sweep: pathlib.Path, slot: Slot) -> dict[str, str]:
@@ -86,7 +91,9 @@ def slots(workers: int | None = None) -> list[Slot]:
     """
     gpus = _gpus()
     if gpus:
-        return [f"gpu{index}" for index in range(min(workers or gpus, gpus))]
+        visible = os.environ.get("CUDA_VISIBLE_DEVICES")  # on a shared machine the other GPUs are not ours
+        names = visible.split(",") if visible else [str(index) for index in range(gpus)]
+        return [f"gpu{name.strip()}" for name in names[:gpus]][:workers]
     if hasattr(os, "sched_getaffinity"):
         cores = [str(core) for core in sorted(os.sched_getaffinity(0))]
     else:

@@ -58,7 +58,7 @@ class Training:
     task: str
     settings: dict[str, Any]  # hyperparameters
     options: dict[str, Any]  # training options; seed, seeds and steps are always present
-    observe: tuple[int | str, ...] = ()
+    observe: tuple[str, ...] = ()  # as text, which is the form of the command line
     constants: dict[str, Any] = dataclasses.field(default_factory=dict)
     faults: dict[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -74,7 +74,7 @@ class Training:
         """The arguments of `beliefrl` that start this training, or continue it."""
         given = [*self.settings.items(), *self.options.items(), *self.faults.items()]
         flags = [part for name, value in given for part in _flag(name, value)]
-        seen = ["--observe", *map(str, self.observe)] if self.observe else []
+        seen = ["--observe", *self.observe] if self.observe else []
         made = ["--constants", *(f"{name}={json.dumps(value)}" for name, value in self.constants.items())]
         return [
             *("train", self.agent, self.task, *flags, *seen, *(made if self.constants else [])),
@@ -170,7 +170,10 @@ def extended(
                 present |= set(training.seeds)
         added.append(dataclasses.replace(experiment, seeds=tuple(set(experiment.seeds) - present)))
     _check(trainings.values())
-    return [*trainings.values(), *plan(added, seeds_per_run)]
+    new = plan(added, seeds_per_run)
+    for name in (each.name for each in new if each.name in trainings):
+        raise UserError(f"The sweep has a training {name} with other settings: choose another --out, in Python out=.")
+    return [*trainings.values(), *new]
 
 
 def _line(training: Training) -> tuple[Any, ...]:
@@ -214,7 +217,7 @@ def _training(experiment: Experiment, first: int, count: int) -> Training:
         experiment.task,
         settings,
         options,
-        tuple(experiment.observe),
+        tuple(map(str, experiment.observe)),
         dict(experiment.constants),
         faults,
     )

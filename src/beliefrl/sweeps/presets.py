@@ -25,7 +25,6 @@ SCALABILITY_STEPS = 100_000  # the paper's table (Appendix G)
 LEARNING_RATES = (4e-4, 6e-4, 8e-4, 1e-3)  # Appendix F
 LENGTHS = (16, 32, 64)
 TIMESTEPS = 256  # timesteps in a batch, for every sequence length
-REPEATS = 20
 PAPERS = {"lr_model": 8e-4, "seq_len": 64, "batch_size": 4}  # Table 2
 
 
@@ -35,7 +34,8 @@ class Preset:
 
     tasks: Sequence[str]
     agents: Sequence[str]
-    make: Callable[[Sequence[str], Sequence[str], Sequence[int] | None], list[Experiment]]  # tasks, agents, seeds
+    make: Callable[[Sequence[str], Sequence[str], Sequence[int]], list[Experiment]]  # tasks, agents, seeds
+    seeds: int = 5  # per experiment (Appendix B)
 
 
 def steps(task: str) -> int:
@@ -43,10 +43,9 @@ def steps(task: str) -> int:
     return next((count for name, count in STEPS.items() if task.startswith(name)), ROBOT_STEPS)
 
 
-def _compared(tasks: Sequence[str], agents: Sequence[str], seeds: Sequence[int] | None) -> list[Experiment]:
-    """Every agent on every task, with 5 seeds unless `seeds` is given (Appendix B)."""
-    numbers = range(5) if seeds is None else seeds
-    return [each for task in tasks for each in grid(agents, [task], seeds=numbers, steps=steps(task))]
+def _compared(tasks: Sequence[str], agents: Sequence[str], seeds: Sequence[int]) -> list[Experiment]:
+    """Every agent on every task."""
+    return [each for task in tasks for each in grid(agents, [task], seeds=seeds, steps=steps(task))]
 
 
 def drawn(seed: int) -> dict[str, float]:
@@ -56,21 +55,20 @@ def drawn(seed: int) -> dict[str, float]:
     return {"lr_model": float(random.choice(LEARNING_RATES)), "seq_len": length, "batch_size": TIMESTEPS // length}
 
 
-def _sensitivity(tasks: Sequence[str], agents: Sequence[str], seeds: Sequence[int] | None) -> list[Experiment]:
-    """20 seeds with the paper's settings, and 20 seeds with settings drawn for each seed (Appendix F)."""
-    numbers = range(REPEATS) if seeds is None else seeds
+def _sensitivity(tasks: Sequence[str], agents: Sequence[str], seeds: Sequence[int]) -> list[Experiment]:
+    """The seeds with the paper's settings, and with settings drawn for each seed (Appendix F)."""
     experiments = []
-    for each in _compared(tasks, agents, numbers):
+    for each in _compared(tasks, agents, seeds):
         experiments.append(each)
-        for seed in numbers:
+        for seed in seeds:
             if drawn(seed) != PAPERS:  # otherwise the experiment above is the same
                 settings = {**each.settings, **drawn(seed)}
                 experiments.append(dataclasses.replace(each, settings=settings, seeds=(seed,)))
     return experiments
 
 
-def _scalability(tasks: Sequence[str], agents: Sequence[str], seeds: Sequence[int] | None) -> list[Experiment]:
-    return grid(agents, tasks, seeds=[0] if seeds is None else seeds, steps=SCALABILITY_STEPS)
+def _scalability(tasks: Sequence[str], agents: Sequence[str], seeds: Sequence[int]) -> list[Experiment]:
+    return grid(agents, tasks, seeds=seeds, steps=SCALABILITY_STEPS)
 
 
 PRESETS = {
@@ -78,8 +76,8 @@ PRESETS = {
     "robots": Preset(ROBOTS, COMPARED, _compared),  # Section 5.2
     "memory": Preset(MEMORY, COMPARED, _compared),  # Section 5.3
     "ablation": Preset(EVERY, ABLATIONS, _compared),  # Appendix C
-    "sensitivity": Preset(EVERY, ("vrm",), _sensitivity),  # Appendix F
-    "scalability": Preset(("hopper-v",), COMPARED, _scalability),  # Appendix G; timed, so one training at a time
+    "sensitivity": Preset(EVERY, ("vrm",), _sensitivity, seeds=20),  # Appendix F
+    "scalability": Preset(("hopper-v",), COMPARED, _scalability, seeds=1),  # Appendix G; timed, one training at a time
 }
 
 
@@ -97,4 +95,5 @@ def preset(
     if name not in PRESETS:
         raise UserError(f"There is no preset {name!r}: give one of {', '.join(PRESETS)}.")
     chosen = PRESETS[name]
-    return chosen.make(tasks or chosen.tasks, agents or chosen.agents, seeds)
+    numbers = range(chosen.seeds) if seeds is None else seeds
+    return chosen.make(tasks or chosen.tasks, agents or chosen.agents, numbers)

@@ -67,14 +67,14 @@ def sweep(
         _check_named(folder, before, experiments)
         slots = [] if ray else ["-"] if workers == 0 else local.slots(workers)
         launcher = cluster.Cluster(folder, ray, workers) if ray else local.Local(folder, slots)
-        on_gpu = launcher.has_gpus if isinstance(launcher, cluster.Cluster) else slots[0].startswith("gpu")
-        together = seeds_per_run or (ALL if on_gpu else None)
-        status = _status(folder, plans.extended(before, experiments, together))
-        with reporting(folder, report, progress) as listen, Requests() as requests:
-            try:
+        try:
+            on_gpu = launcher.has_gpus if isinstance(launcher, cluster.Cluster) else slots[0].startswith("gpu")
+            together = seeds_per_run or (ALL if on_gpu else None)
+            status = _status(folder, plans.extended(before, experiments, together))
+            with reporting(folder, report, progress) as listen, Requests() as requests:
                 _loop(folder, status, launcher, listen, requests)
-            finally:
-                launcher.stop()
+        finally:
+            launcher.stop()  # also closes the connection to a Ray cluster
     if status.failed:
         name, error = next(iter(status.failed.items()))
         raise UserError(
@@ -137,8 +137,9 @@ def _loop(folder: pathlib.Path, status: SweepStatus, launcher: Launcher, report:
 
 
 def reason(log: pathlib.Path, code: int) -> str:
-    """Why a training failed: its last error message, or else the last line of its output."""
-    lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    """Why a training failed: its last error message, or else the last line of its output, in this session."""
+    _, _, output = log.read_text(errors="replace").rpartition(local.BEGIN)
+    lines = [line.strip() for line in output.splitlines() if line.strip()]
     messages = [line.removeprefix("beliefrl: ") for line in lines if line.startswith("beliefrl: ")] or lines
     return messages[-1] if messages else f"it ended with code {code} and printed nothing"
 

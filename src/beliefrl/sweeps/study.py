@@ -148,7 +148,9 @@ def open_study(folder: pathlib.Path, search: Search, prune: bool) -> Any:
     seed = search.base.options["seed"] + count  # a resumed study does not draw the same numbers again
     study.sampler = package.samplers.TPESampler(seed=seed)
     if RECORD in study.user_attrs:
-        _check_same(folder, study.user_attrs[RECORD], search.record)
+        recorded = study.user_attrs[RECORD]
+        as_text = {"observe": [str(entry) for entry in recorded.get("observe", ())]}  # older studies may have numbers
+        _check_same(folder, recorded | as_text, search.record)
     else:
         study.set_user_attr(RECORD, search.record)
         own = {name: getattr(search.agent, name) for name in search.ranges}

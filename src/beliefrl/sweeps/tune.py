@@ -269,8 +269,9 @@ class _Loop:
                 self.study.tell(trial, value)
                 self.status.notes[name] = f"objective {value:.1f}"
                 self.status.finished.append(training)
-            elif code in STOPPED:  # it continues in the next session
-                self.status.waiting.append(training)
+            elif code in STOPPED:  # it continues now if only this trial was stopped, or else in the next session
+                self.status.waiting.insert(len(self.stopped), training)
+                self.stopped.append((trial, trial.user_attrs["settings"]))
             else:
                 self._failed(name, trial, reason(self.folder / "logs" / f"{name}.log", code))
 
