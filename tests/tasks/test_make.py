@@ -30,7 +30,8 @@ KEYS = jax.random.split(jax.random.key(0), 5)
 
 
 def test_the_listed_names_are_the_tasks_there_are():
-    robots = [name + mask for name in ("hopper", "walker2d", "ant", "halfcheetah") for mask in ("", "-v", "-p")]
+    runners = ("hopper", "walker2d", "ant", "halfcheetah")
+    robots = [kind + name + mask for kind in ("", "mujoco-") for name in runners for mask in ("", "-v", "-p")]
     assert list(names()) == [*SIZES, *robots]
     assert all(names().values())
 
