@@ -229,7 +229,7 @@ def test_an_environment_of_ones_own_is_never_recorded_as_one_of_our_tasks():
 
 
 def test_a_selection_of_a_selection_is_recorded_as_entries_of_the_full_observation():
-    robot = tasks.make("hopper-v")
+    robot = GymnasiumTask(Fine, "hopper-v", indices=catalogue.ROBOTS["hopper"].velocities)
     one = dataclasses.replace(robot, indices=(robot.indices[1],))  # as observe=[1] does
     assert tasks.describe(one)["task"] == "hopper"
     assert tasks.describe(one)["observe"] == [4]
