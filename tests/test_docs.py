@@ -214,8 +214,13 @@ def test_an_example_says_what_quick_does(name):
     assert f"python examples/{name} --quick  " in (EXAMPLES / name).read_text()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", PHRASES)
+NIGHTLY = ("02_a_task_in_jax.py", "06_many_trainings.py")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.nightly if name in NIGHTLY else pytest.mark.slow) for name in PHRASES],
+)
 def test_an_example_runs_and_can_be_started_again(tmp_path, name):
     if name.startswith("05"):
         pytest.importorskip("sb3_contrib")

@@ -32,7 +32,9 @@ def trained(name):
     return agent, jax.jit(lambda key: agent.init(key, TASK.spec))(jax.random.key(0))
 
 
-@pytest.mark.parametrize("name", SMALL)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name == "slac" else ()) for name in SMALL]
+)
 def test_it_acts_as_the_agent_does_through_episodes(name):
     """Two episodes in one batch, one of which restarts while the other continues: mode actions at every step."""
     agent, state = trained(name)

@@ -175,10 +175,8 @@ def test_it_reaches_every_phase_and_a_resumed_run_keeps_it(tmp_path, lowered, pr
     assert json.loads((run.folder / "config.json").read_text())["options"]["precision"] == precision
 
 
-@pytest.mark.parametrize(
-    "precision",
-    [*(pytest.param(name, marks=pytest.mark.nightly) for name in ASKED), pytest.param(None, marks=pytest.mark.slow)],
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize("precision", [*ASKED, None])
 def test_what_is_made_of_a_run_has_its_precision(tmp_path, monkeypatch, precision):
     """None: of a run that was made before there was a choice."""
     run = saved(tmp_path / "run", "vrm", tasks.make("pendulum-v", max_steps=3))

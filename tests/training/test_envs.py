@@ -73,7 +73,7 @@ def test_environments_of_a_seed_begin_and_act_differently():
     assert len({tuple(row) for row in np.asarray(seed.actor.step.obs).tolist()}) == ENVS
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_host_loop_learns_what_the_compiled_loop_learns():
     agent = agents.make("sac-mlp", **SHARED, batch_size=8, pretrain_updates=10)
     task, keys = Hanging(max_steps=9), jax.random.split(jax.random.key(0), 2)

@@ -31,7 +31,7 @@ SMALL = {
 }
 
 
-MARKS = {"sac-mlp": pytest.mark.slow, "vrm": pytest.mark.slow}
+MARKS = {"sac-mlp": pytest.mark.slow}
 
 
 @pytest.fixture(

@@ -92,6 +92,7 @@ def stopped(folder, script, number):
     return process.returncode, out, err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_script_ends_with_one_sentence_and_the_exit_code_of_the_command_line(tmp_path, number, code):
     ended, _, err = stopped(tmp_path, "train()", number)

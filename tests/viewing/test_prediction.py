@@ -183,6 +183,7 @@ def test_what_cannot_be_predicted_is_an_error_in_one_sentence(tmp_path, name, ch
         few(run, **changes)
 
 
+@pytest.mark.slow
 def test_the_figure_has_a_row_for_each_entry_that_is_asked_for(tmp_path):
     predicted = few(saved(tmp_path / "run", "slac", tasks.make("pendulum", (2, 0), max_steps=12)))
     assert predicted.entries == (2, 0)
