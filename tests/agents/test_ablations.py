@@ -47,6 +47,7 @@ def test_it_has_its_models_and_each_learns_in_its_time(name):
 
 
 @pytest.mark.parametrize("name", ["vrm-single", "vrm-first"])
+@pytest.mark.slow
 def test_acting_forms_the_belief_that_replay_forms(name):
     agent, state, window = made(name)
     agent = dataclasses.replace(agent, store_first_impression=False, deterministic=True)

@@ -195,6 +195,7 @@ def test_timesteps_that_do_not_exist_enter_no_loss(state):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7), *results)
 
 
+@pytest.mark.slow
 def test_a_recomputed_first_impression_is_the_stored_one_up_to_its_sample(state):
     """With notes that the model itself made, both ways of forming beliefs agree on everything but the draw of z."""
     recompute = dataclasses.replace(AGENT, store_first_impression=False)

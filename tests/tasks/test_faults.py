@@ -125,6 +125,7 @@ def test_faulty_sensors_do_not_change_the_true_episode():
     assert (np.asarray(faulty[0]) != np.asarray(true[0])).any(axis=1).all()
 
 
+@pytest.mark.slow
 def test_a_task_among_others_is_the_same_as_alone():
     task, keys = make("pendulum", faults=Faults(0.1, 0.2, True, 0.2, 2, 0.3)), jax.random.split(KEY, 4)
     together = jax.jit(jax.vmap(lambda key: compiled_episode(task, key, ACTIONS[:60])))(keys)

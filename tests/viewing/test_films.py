@@ -213,6 +213,7 @@ def test_the_package_contains_the_demos_and_the_help_names_them(capsys):
 
 
 @pytest.mark.parametrize(("task", "tolerance"), [("cartpole-v", 100), ("pendulum-v", 100), ("target-reaching", 50)])
+@pytest.mark.slow
 def test_a_demo_is_a_run_that_acts_as_well_as_it_says(tmp_path, task, tolerance):
     run = beliefrl.demo(task, tmp_path / "run")
     assert run.config["task"] == task

@@ -79,6 +79,7 @@ def test_the_open_loop_decodes_the_posterior_and_the_closed_loop_goes_on_from_it
     assert not np.allclose(ask(model, ALL).mean[START:], ask(model, BEFORE).mean[START:])
 
 
+@pytest.mark.slow
 def test_slacs_open_loop_is_what_is_decoded_from_the_posterior():
     model = begun("slac", TASK.spec, jax.random.key(3)).model
     noise = normal(4, TIME, 2), normal(5, TIME, 4)
