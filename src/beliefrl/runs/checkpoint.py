@@ -1,4 +1,4 @@
-"""Checkpoints: the whole state of a training, written atomically. This file handles trees of arrays only.
+"""Checkpoints: the whole state of a training, written atomically. They handle trees of arrays only.
 
     checkpoints/
       000004-step-12000/     renamed to this name once all of its files are on the disk
@@ -12,10 +12,7 @@ Files are plain numbers and JSON: reading them runs no code.
 """
 
 import hashlib
-import itertools
 import json
-import math
-import operator
 import os
 import pathlib
 import re
@@ -25,11 +22,11 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
-from beliefrl.runs import arrays
+from beliefrl.runs import arrays, segments
 from beliefrl.runs.arrays import Damaged, sync_folder, write_whole
+from beliefrl.runs.segments import New, Segment
 from beliefrl.types import UserError
 
 FORMAT = 1
@@ -43,20 +40,8 @@ class Found(NamedTuple):
     progress: dict[str, Any]
     tree: Any
     timesteps: Any  # numpy, leaves (*rings, capacity, ...)
-    missing: (
-        np.ndarray
-    )  # (*rings,), how many of the first timesteps ever added are in no file; the rings do without them
+    missing: np.ndarray  # (*rings,), how many of the first timesteps ever added are in no file, nor in the rings
     passed_over: list[str]  # one sentence for each newer checkpoint, which is damaged
-
-
-class Segment(NamedTuple):
-    """A file with timesteps `start` to `stop` of every ring, counted from the first that was ever added."""
-
-    file: str
-    start: list[int]
-    stop: list[int]
-    size: int
-    sha256: str
 
 
 class Checkpoints:
@@ -83,7 +68,7 @@ class Checkpoints:
             OSError: the previous checkpoint could not be written.
         """
         self.wait()
-        state, new = arrays.copied(tree), self._new_timesteps(timesteps, added)
+        state, new = arrays.copied(tree), segments.new(timesteps, added, self._segments)
         self._writing = self._thread.submit(self._write, step, progress, state, new)
 
     def forget_timesteps(self) -> None:
@@ -137,31 +122,14 @@ class Checkpoints:
 
     # Writing
 
-    def _new_timesteps(
-        self, timesteps: Any, added: np.ndarray
-    ) -> tuple[list[int], list[int], int, dict[str, np.ndarray]]:
-        """Start, stop, capacity and the timesteps that are in no file yet, (ring, new). Shorter rings are padded."""
-        capacity = jax.tree.leaves(timesteps)[0].shape[added.ndim]
-        stop = [int(number) for number in added.flat]
-        written = self._segments[-1].stop if self._segments else [0] * len(stop)
-        start = [max(old, new - capacity) for old, new in zip(written, stop, strict=True)]
-        longest = max(new - old for old, new in zip(start, stop, strict=True))
-        index = (np.array(start)[:, None] + np.arange(longest)) % capacity
-        rings = (axis[:, None] for axis in np.unravel_index(np.arange(len(stop)), added.shape))
-        where = (*rings, index)
-        return start, stop, capacity, arrays.copied(jax.tree.map(lambda leaf: _on_host(leaf)[where], timesteps))
-
-    def _write(self, step: int, progress: dict[str, Any], state: dict[str, np.ndarray], new: Any) -> None:
-        start, stop, capacity, timesteps = new
+    def _write(self, step: int, progress: dict[str, Any], state: dict[str, np.ndarray], new: New) -> None:
         replay = self.folder / "replay"
         replay.mkdir(parents=True, exist_ok=True)
-        if stop != (self._segments[-1].stop if self._segments else None):
-            path, content = replay / f"{_next_number(replay):06d}.safetensors", arrays.packed(timesteps)
+        if new.stop != (self._segments[-1].stop if self._segments else None):
+            path, content = replay / f"{_next_number(replay):06d}.safetensors", arrays.packed(new.timesteps)
             write_whole(path, content)
-            self._segments.append(Segment(path.name, start, stop, len(content), _sha256(content)))
-            oldest = [number - capacity for number in stop]
-            alive = (any(map(operator.gt, segment.stop, oldest)) for segment in self._segments)
-            self._segments = list(itertools.compress(self._segments, alive))
+            written = Segment(path.name, new.start, new.stop, len(content), _sha256(content))
+            self._segments = segments.needed([*self._segments, written], new.capacity)
         final = self.folder / f"{_next_number(self.folder):06d}-step-{step}"
         temporary = self.folder / f".{final.name}.tmp"
         for left in self.folder.glob(".*.tmp"):  # left by a process that was killed
@@ -170,8 +138,8 @@ class Checkpoints:
         content = arrays.packed(state)
         write_whole(temporary / "state.safetensors", content)
         files = {"state.safetensors": {"size": len(content), "sha256": _sha256(content)}}
-        segments = [segment._asdict() for segment in self._segments]
-        manifest = {"format": FORMAT, "step": step, "progress": progress, "files": files, "replay": segments}
+        named = [segment._asdict() for segment in self._segments]
+        manifest = {"format": FORMAT, "step": step, "progress": progress, "files": files, "replay": named}
         write_whole(temporary / "manifest.json", _signed(manifest))
         temporary.rename(final)
         sync_folder(self.folder)
@@ -221,7 +189,7 @@ class Checkpoints:
                 continue
             tree = arrays.read(path / "state.safetensors", like, renamed)
             self._segments = [Segment(**segment) for segment in content["replay"]]
-            rings, missing = self._timesteps(timesteps, self._segments, axes)
+            rings, missing = segments.read(self.folder / "replay", timesteps, self._segments, axes)
             if missing.any():  # the rings are numbered anew, so the files do not continue them
                 self._segments = []
             return Found(content["step"], content["progress"], tree, rings, missing, passed_over)
@@ -241,31 +209,6 @@ class Checkpoints:
         for segment in content["replay"]:
             _check(self.folder / "replay" / segment["file"], segment["size"], segment["sha256"])
         return content
-
-    def _timesteps(self, like: Any, segments: list[Segment], axes: int) -> tuple[Any, np.ndarray]:
-        """The rings, and how many timesteps each has lost at its beginning.
-
-        A ring that has become larger may ask for timesteps that were overwritten before they were saved. It is numbered
-        from its first saved timestep on.
-        """
-        shape = jax.tree.leaves(like)[0].shape[: axes + 1]
-        begin = np.array(segments[0].start if segments else np.zeros(math.prod(shape[:-1]), int))
-        stop = np.array(segments[-1].stop) if segments else begin
-        missing = np.where((begin > np.maximum(stop - shape[-1], 0)).any(), begin, 0)
-        rings = jax.tree.map(
-            lambda leaf: np.zeros((math.prod(leaf.shape[:axes]), *leaf.shape[axes:]), leaf.dtype), like
-        )
-        for segment in segments:
-            path = self.folder / "replay" / segment.file
-            saved = arrays.load(path)
-            for where, ring in jax.tree_util.tree_leaves_with_path(rings):
-                name = jax.tree_util.keystr(where)
-                if name not in saved or saved[name].shape[2:] != ring.shape[2:]:
-                    raise arrays.misfit(path, name)
-                for number, (start, stop) in enumerate(zip(segment.start, segment.stop, strict=True)):
-                    index = (np.arange(start, stop) - missing[number]) % ring.shape[1]
-                    ring[number, index] = saved[name][number, : stop - start]
-        return jax.tree.map(lambda ring, leaf: ring.reshape(leaf.shape), rings, like), missing.reshape(shape[:-1])
 
 
 def listed(folder: pathlib.Path) -> list[pathlib.Path]:
@@ -291,11 +234,6 @@ def _linked(source: str, target: str) -> None:
         os.link(source, target)
     except OSError:
         shutil.copy2(source, target)
-
-
-def _on_host(leaf: Any) -> Any:
-    """On a CPU a view of JAX's memory, without a copy. On other devices the array itself, which is indexed there."""
-    return np.asarray(leaf) if jax.default_backend() == "cpu" else leaf
 
 
 def _sha256(content: bytes) -> str:
