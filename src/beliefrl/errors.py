@@ -14,6 +14,11 @@ class UsageError(Exception):
     """A mistake on the command line; the message is one sentence."""
 
 
+def cause(error: OSError) -> str:
+    """What the operating system says of an error; libraries also raise an OSError with a text of their own."""
+    return error.strerror or one_line(str(error))
+
+
 def said(error: BaseException) -> str:
     """The type and message of an exception of other code, on one line, without control characters."""
     text = one_line(str(error))[:300].rstrip(".")

@@ -12,7 +12,7 @@ import functools
 import os
 import pathlib
 from collections.abc import Callable
-from numbers import Integral, Real
+from numbers import Real
 from typing import Any
 
 import jax
@@ -29,7 +29,7 @@ from beliefrl.tasks import Task
 from beliefrl.tasks.environment import TaskEnvironment
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.evaluation import restore_seed
-from beliefrl.types import LARGEST, Spec, Timestep, UserError, as_array, short
+from beliefrl.types import LARGEST, Spec, Timestep, UserError, as_array, cause, check_whole, short
 
 State = tuple[np.ndarray, ...]
 
@@ -101,8 +101,7 @@ class Policy:
         Raises:
             UserError: `batch` is not a whole number of at least 1.
         """
-        if not isinstance(batch, Integral) or batch < 1:
-            raise UserError(f"batch={short(batch)} is impossible: it must be a whole number of at least 1.")
+        check_whole("batch", batch, 1)
         leaves = [*jax.tree.leaves(self._empty), np.zeros(self.spec.action_dim, np.float32)]
         return tuple(np.repeat(np.asarray(leaf)[None], batch, axis=0) for leaf in leaves)
 
@@ -202,7 +201,7 @@ class Policy:
         try:
             write_whole(path, content)
         except OSError as error:
-            raise UserError(f"{path} cannot be written ({error.strerror}): choose another file.") from None
+            raise UserError(f"{path} cannot be written ({cause(error)}): choose another file.") from None
         return difference
 
     def _for_jax(self) -> bytes:

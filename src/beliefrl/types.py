@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from beliefrl.errors import UserError as UserError
+from beliefrl.errors import cause as cause
 from beliefrl.errors import one_line as one_line
 from beliefrl.errors import said as said
 from beliefrl.errors import short as short
@@ -41,10 +42,20 @@ def check_range(settings: Any, names: Sequence[str], low: int | float, high: int
         fits = isinstance(value, tuple) == several and len(entries) == (count or max(len(entries), 1))
         if not fits or not numeric or not all(low <= entry <= high for entry in entries):
             too_large = numeric and any(entry > high for entry in entries)
-            bounds = f"from {low} to {high}" if too_large or high < LARGEST else f"of at least {low}"
             number = "whole number" if whole else "number"
             what = f"{count or 'a tuple of'} {number}s" if several else f"a {number}"
-            raise UserError(f"{name}={value} is impossible: it must be {what} {bounds}.")
+            raise UserError(f"{name}={value} is impossible: it must be {what} {_bounds(low, high, too_large)}.")
+
+
+def check_whole(name: str, value: Any, low: int, high: int = LARGEST) -> None:
+    """Raise a UserError if the value of an argument is not a whole number in [low, high]."""
+    if not _is_number(value, whole=True) or not low <= value <= high:
+        bounds = _bounds(low, high, too_large=_is_number(value, whole=True) and value > high)
+        raise UserError(f"{name}={short(value)} is impossible: it must be a whole number {bounds}.")
+
+
+def _bounds(low: int | float, high: int | float, too_large: bool) -> str:
+    return f"from {low} to {high}" if too_large or high < LARGEST else f"of at least {low}"
 
 
 def _is_number(value: Any, whole: bool) -> bool:

@@ -5,7 +5,7 @@ import pathlib
 from typing import Any
 
 from beliefrl.runs.arrays import write_whole
-from beliefrl.types import UserError
+from beliefrl.types import UserError, cause
 
 KINDS = (".png", ".pdf")
 
@@ -56,5 +56,5 @@ def save(figure: Any, path: pathlib.Path) -> pathlib.Path:
         try:
             write_whole(name, content.getvalue())
         except OSError as error:
-            raise UserError(f"{name} cannot be written ({error.strerror}): choose another file.") from None
+            raise UserError(f"{name} cannot be written ({cause(error)}): choose another file.") from None
     return paths(path)[0]

@@ -19,7 +19,7 @@ import numpy as np
 
 from beliefrl.runs.arrays import write_whole
 from beliefrl.runs.run import Row, Run
-from beliefrl.types import UserError
+from beliefrl.types import UserError, cause
 
 ENDING = ".json.gz"
 FORMAT = 1
@@ -98,7 +98,7 @@ def write(path: pathlib.Path, runs: Sequence[Run], defaults: Mapping[str, Row]) 
     try:
         write_whole(path, gzip.compress(json.dumps(content, separators=(",", ":")).encode(), mtime=0))
     except OSError as error:
-        raise UserError(f"{path} cannot be written ({error.strerror}): choose another file.") from None
+        raise UserError(f"{path} cannot be written ({cause(error)}): choose another file.") from None
 
 
 def changed(hyperparameters: Row, defaults: Row) -> Row:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from beliefrl.runs.arrays import write_whole
-from beliefrl.types import UserError
+from beliefrl.types import UserError, cause
 
 
 class Column(NamedTuple):
@@ -53,5 +53,5 @@ def write_table(columns: Sequence[Column], rows: Sequence[Cells], out: pathlib.P
         write_whole(out.with_suffix(".tex"), latex(columns, rows).encode())
         write_whole(out.with_suffix(".md"), markdown(columns, rows).encode())
     except OSError as error:
-        raise UserError(f"{out} cannot be written ({error.strerror}): choose another --out.") from None
+        raise UserError(f"{out} cannot be written ({cause(error)}): choose another --out.") from None
     return out.with_suffix(".md")

@@ -74,12 +74,12 @@ def _experiments(options: SweepOptions) -> list:
     """The experiments that the options define. Empty: continue the sweep in --out."""
     from beliefrl.runs.options import Options
     from beliefrl.sweeps import files, plan, presets
-    from beliefrl.types import check_range
+    from beliefrl.types import check_range, check_whole
 
     check_range(options, ("scale",), 0, 1)
     for name in ("seeds", "steps", "workers", "seeds_per_run"):
-        if getattr(options, name) is not None and getattr(options, name) < 1:
-            raise UsageError(f"{name}={getattr(options, name)} is impossible: it must be a whole number of at least 1.")
+        if getattr(options, name) is not None:
+            check_whole(name, getattr(options, name), 1)
     first, count = options.seed or 0, options.seeds or (2 if options.scale < 1 else None)
     Options(seed=first, seeds=count or 1)
     if options.file is not None:

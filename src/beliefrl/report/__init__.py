@@ -21,7 +21,7 @@ from typing import Any
 from beliefrl.analysis.groups import find
 from beliefrl.report.data import CachedRun, page_data
 from beliefrl.runs.arrays import write_whole
-from beliefrl.types import UserError
+from beliefrl.types import UserError, cause
 
 
 def write_report(
@@ -55,7 +55,7 @@ def write_report(
     try:
         write_whole(out, content.encode())
     except OSError as error:
-        raise UserError(f"{out} cannot be written ({error.strerror}): choose another --out.") from None
+        raise UserError(f"{out} cannot be written ({cause(error)}): choose another --out.") from None
     if note is not None:
         for sentence in found.damage:
             note(sentence)

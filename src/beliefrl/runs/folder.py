@@ -10,7 +10,7 @@ from typing import Any
 
 from beliefrl.runs import records
 from beliefrl.runs.arrays import write_whole
-from beliefrl.types import UserError
+from beliefrl.types import UserError, cause
 
 MAKING = r"metrics|lock|\.config\.json\.tmp"  # files that are made before config.json
 UNSAVED = (  # files of a training that has saved no agent and no checkpoint
@@ -33,7 +33,7 @@ def make(folder: pathlib.Path, config: dict[str, Any]) -> None:
         (folder / "metrics").mkdir()
         write_config(folder, config)
     except OSError as error:
-        raise UserError(f"The run folder {folder} cannot be made ({error.strerror}): choose another --out.") from None
+        raise UserError(f"The run folder {folder} cannot be made ({cause(error)}): choose another --out.") from None
 
 
 def clear(folder: pathlib.Path) -> None:
@@ -71,7 +71,7 @@ def locked(folder: pathlib.Path, doing: str) -> Any:
     try:
         file = (folder / "lock").open("a+")
     except OSError as error:
-        raise UserError(f"{folder} cannot be written ({error.strerror}): make it writable, or copy it.") from None
+        raise UserError(f"{folder} cannot be written ({cause(error)}): make it writable, or copy it.") from None
     try:
         import fcntl
 
@@ -90,7 +90,7 @@ def locked(folder: pathlib.Path, doing: str) -> Any:
     except OSError as error:
         with contextlib.suppress(OSError):
             file.close()
-        raise UserError(f"{folder} cannot be written ({error.strerror}): free some space.") from None
+        raise UserError(f"{folder} cannot be written ({cause(error)}): free some space.") from None
     return file
 
 

@@ -9,7 +9,7 @@ import pathlib
 from collections.abc import Iterator
 from typing import Any
 
-from beliefrl.types import LARGEST, UserError
+from beliefrl.types import LARGEST, UserError, cause
 
 Row = dict[str, Any]
 
@@ -66,7 +66,7 @@ def lines(log: pathlib.Path) -> Iterator[tuple[int, Row | None]]:
                 if line.endswith("\n"):
                     yield number, _row(line)
     except OSError as error:
-        raise UserError(f"{log} cannot be read ({error.strerror}): restore it from a copy.") from None
+        raise UserError(f"{log} cannot be read ({cause(error)}): restore it from a copy.") from None
 
 
 def last_rows(log: pathlib.Path, size: int = 32_768) -> list[Row]:
@@ -83,7 +83,7 @@ def last_rows(log: pathlib.Path, size: int = 32_768) -> list[Row]:
             file.seek(start)
             parts = file.read().decode(errors="replace").split("\n")
     except OSError as error:
-        raise UserError(f"{log} cannot be read ({error.strerror}): restore it from a copy.") from None
+        raise UserError(f"{log} cannot be read ({cause(error)}): restore it from a copy.") from None
     rows = map(_row, parts[1:-1] if start else parts[:-1])
     return [row for row in rows if row is not None]
 

@@ -32,7 +32,7 @@ from beliefrl.runs.options import Options
 from beliefrl.runs.provenance import now
 from beliefrl.runs.records import Row
 from beliefrl.runs.trackers import Tracker
-from beliefrl.types import UserError, tuples
+from beliefrl.types import UserError, cause, tuples
 
 
 class Run:
@@ -201,9 +201,7 @@ class Recorder(Run):
             try:
                 self._lines[seed] = path.open("a", buffering=1)
             except OSError as error:
-                raise UserError(
-                    f"{path} cannot be written ({error.strerror}): fix the cause, then try again."
-                ) from None
+                raise UserError(f"{path} cannot be written ({cause(error)}): fix the cause, then try again.") from None
             self._trackers[seed] = trackers.open_all(track, self.folder, seed, self.config)
 
     def note_end(self) -> None:

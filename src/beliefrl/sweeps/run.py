@@ -14,7 +14,7 @@ from beliefrl.sweeps import plan as plans
 from beliefrl.sweeps.plan import Experiment, Training
 from beliefrl.sweeps.progress import SweepStatus
 from beliefrl.training.stop import Requests, Stopped
-from beliefrl.types import UserError, one_line
+from beliefrl.types import UserError, cause, one_line
 
 LOOK_EVERY = 0.5  # seconds
 ALL = 10_000  # seeds in one run, more than any experiment has
@@ -153,5 +153,5 @@ def lock(folder: pathlib.Path) -> Any:
     try:
         (folder / "logs").mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UserError(f"The folder {folder} cannot be made ({error.strerror}): choose another --out.") from None
+        raise UserError(f"The folder {folder} cannot be made ({cause(error)}): choose another --out.") from None
     return locked(folder, "is in use")

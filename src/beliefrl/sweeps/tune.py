@@ -27,7 +27,7 @@ from beliefrl.sweeps.progress import SweepStatus
 from beliefrl.sweeps.run import lock, reason, reporting
 from beliefrl.sweeps.study import Actions, Objective, Search, Trial
 from beliefrl.training.stop import Requests, Stopped
-from beliefrl.types import UserError
+from beliefrl.types import UserError, cause, check_whole
 
 LOOK_EVERY = 1.0  # seconds
 PATIENCE = 3  # failures, without any other trial, after which tuning ends
@@ -110,7 +110,7 @@ def tune(
         raise
     except OSError as error:
         raise UserError(
-            f"{folder} cannot be written ({error.strerror}): fix that, then the same command continues."
+            f"{folder} cannot be written ({cause(error)}): fix that, then the same command continues."
         ) from None
 
 
@@ -142,10 +142,8 @@ def _run(folder: pathlib.Path, search: Search, trials: int, prune: bool, workers
 
 
 def _check(trials: int, seeds: int, seed: int, workers: int | None, objective: str, actions: str) -> None:
-    counts = {"trials": trials, "workers": 1 if workers is None else workers}
-    for name, count in counts.items():
-        if not isinstance(count, int) or count < 1:
-            raise UserError(f"{name}={count} is impossible: it must be a whole number of at least 1.")
+    check_whole("trials", trials, 1)
+    check_whole("workers", 1 if workers is None else workers, 1)
     Options(seeds=seeds, seed=seed)
     for name, value, known in (("objective", objective, Objective), ("actions", actions, Actions)):
         if value not in get_args(known):

@@ -100,20 +100,18 @@ def entries(task: Any) -> tuple[int, ...]:
     The flag of `Faults.flicker_flag` has the index after the last one of the full observation.
     """
     if faults_of(task) != NONE:
-        inner = without_faults(task)
-        return (*entries(inner), _full(inner).spec.obs_dim) if faults_of(task).flicker_flag else entries(inner)
-    if isinstance(task, Observed):
-        inner = entries(task.task)
-        return tuple(inner[i] for i in task.indices)
+        seen = entries(without_faults(task))
+        return (*seen, full(task).spec.obs_dim) if faults_of(task).flicker_flag else seen
     indices = getattr(task, "indices", None)
     return tuple(range(task.spec.obs_dim)) if indices is None else tuple(indices)
 
 
-def _full(task: Any) -> Any:
-    """The same task with its full observation."""
-    if isinstance(task, Observed):
-        return _full(task.task)
-    return dataclasses.replace(task, indices=None) if isinstance(task, GymnasiumTask) else task
+def full(task: Any) -> Any:
+    """The same task with its full observation and without faults."""
+    task = without_faults(task)
+    if isinstance(task, GymnasiumTask):
+        return dataclasses.replace(task, indices=None)
+    return task.task if isinstance(task, Observed) else task
 
 
 def entry_names(task: Any) -> tuple[str, ...]:

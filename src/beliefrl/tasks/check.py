@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import io
-import numbers
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -14,12 +13,11 @@ from rich.table import Table
 from rich.text import Text
 
 from beliefrl import tasks
-from beliefrl.tasks import Observed, without_faults
 from beliefrl.tasks.environment import TaskEnvironment
 from beliefrl.tasks.gymnasium import ENDLESS, GymnasiumTask
 from beliefrl.tasks.labels import action_names, observation_names
 from beliefrl.tasks.spaces import check_actions, flat_bounds, flat_size
-from beliefrl.types import LARGEST, UserError, short
+from beliefrl.types import LARGEST, UserError, check_whole, short
 
 SCALES = 100.0  # entries whose largest magnitudes differ by more than this factor cause a warning
 MOST_ROWS = 100  # of a printed table
@@ -116,9 +114,8 @@ def check(
     Raises:
         UserError: there is no such task or constant, the environment cannot be made, or a number is out of range.
     """
-    for what, value, least in (("steps", steps, 1), ("seed", seed, 0)):
-        if not isinstance(value, numbers.Integral) or not least <= value <= LARGEST // 2:
-            raise UserError(f"{what}={value} is impossible: it must be a whole number of at least {least}.")
+    check_whole("steps", steps, 1)
+    check_whole("seed", seed, 0, LARGEST // 2)  # each episode has one more
     whole = tasks.make(task, **constants) if isinstance(task, str) else task
     found = _declared(whole)
     if found.refusals:
@@ -134,8 +131,7 @@ def check(
 def _declared(task: Any) -> TaskCheck:
     """The declarations of a task. If its spaces are not supported: the refusals, and no entries."""
     if not isinstance(task, GymnasiumTask):
-        base, spec = _unmasked(task), task.spec
-        names = tasks.entry_names(base)
+        spec, names = task.spec, tasks.entry_names(tasks.full(task))
         entries = tuple(Entry(index, name, -np.inf, np.inf) for index, name in enumerate(names))
         actions = tuple(Entry(index, "", -1.0, 1.0) for index in range(spec.action_dim))
         spaces = f"entries: {len(entries)}", f"entries: {spec.action_dim}, from -1 to 1"
@@ -151,11 +147,6 @@ def _declared(task: Any) -> TaskCheck:
     with contextlib.suppress(Exception):
         environment.close()
     return dataclasses.replace(found, refusals=refusals)
-
-
-def _unmasked(task: Any) -> Any:
-    task = without_faults(task)
-    return task.task if isinstance(task, Observed) else task
 
 
 def _entries(names: Sequence[str], bounds: Any) -> tuple[Entry, ...]:
@@ -178,7 +169,7 @@ def _played(found: TaskCheck, task: Any, steps: int, seed: int) -> TaskCheck:
     """The same with the results of random steps; `task` has the entries that the agent observes."""
     on_host = isinstance(task, GymnasiumTask)
     refusals, observations, rewards, times, ends = list(found.refusals), [], [], [], []
-    environment: Any = task.environment() if on_host else TaskEnvironment(_unmasked(task))
+    environment: Any = task.environment() if on_host else TaskEnvironment(tasks.full(task))
     limit = environment.limit if on_host else task.spec.max_steps
     random, length = np.random.default_rng(seed), 0
     try:

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key, UInt8
 
 from beliefrl import tasks
-from beliefrl.tasks import Observed, Task
+from beliefrl.tasks import Task
 from beliefrl.tasks.drawing import Picture, Viewer, paint
 from beliefrl.tasks.faults import Faulty
 from beliefrl.types import LARGEST, UserError
@@ -89,9 +89,7 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (spec.action_dim,), np.float32)
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (spec.obs_dim,), np.float32)
         # Pictures also show what is hidden from the agent.
-        self._drawn: Any = tasks.without_faults(self.task)
-        while isinstance(self._drawn, Observed):
-            self._drawn = self._drawn.task
+        self._drawn: Any = tasks.full(self.task)
         if hasattr(self._drawn, "dt"):
             self.metadata = self.metadata | {"render_fps": max(1, round(1 / self._drawn.dt))}
         self._states: list[Any] = []

@@ -22,6 +22,7 @@ from gymnasium import error
 from beliefrl.catalogue import BULLET, KNOWN, PREFIX
 from beliefrl.errors import UserError, one_line, said
 from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.types import check_whole
 
 
 def ids() -> list[str]:
@@ -56,8 +57,8 @@ def make(id: str, arguments: dict[str, Any], name: str | None = None) -> Gymnasi
         hint = f"did you mean {near}?" if near else "an environment of another package is named gym:PACKAGE:ID."
         raise UserError(f"Gymnasium has no environment {id!r} ({_first_sentence(found)}): {hint}") from None
     limit = arguments.get("max_episode_steps")
-    if limit is not None and (isinstance(limit, bool) or not (isinstance(limit, int) and limit >= 1)):
-        raise UserError(f"max_episode_steps={limit} is impossible: it must be a whole number of at least 1.")
+    if limit is not None:
+        check_whole("max_episode_steps", limit, 1)
     return GymnasiumTask(_Registered(id), name, dict(arguments))
 
 

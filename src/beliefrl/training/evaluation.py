@@ -1,7 +1,6 @@
 """Returns of trained agents over episodes and seeds, with sampled and with mode actions."""
 
 import contextlib
-import numbers
 import os
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -21,7 +20,7 @@ from beliefrl.training.compilation import keep_compiled
 from beliefrl.training.host_evaluation import Evaluation
 from beliefrl.training.phases import evaluate as evaluate_seed
 from beliefrl.training.rollout import Episode
-from beliefrl.types import LARGEST, UserError, one_line, tuples
+from beliefrl.types import UserError, check_whole, one_line, tuples
 
 MODES = ("sampled", "mode")  # how actions are chosen; the second axis of an evaluation's leaves, after that of seeds
 
@@ -176,10 +175,8 @@ def evaluate(
     Raises:
         UserError: there is no such run, nothing was saved in it, or a number is impossible.
     """
-    if not isinstance(episodes, numbers.Integral) or not 1 <= episodes <= MOST_EPISODES:
-        raise UserError(f"episodes={episodes} is impossible: it must be a whole number from 1 to {MOST_EPISODES}.")
-    if not isinstance(seed, numbers.Integral) or not 0 <= seed <= LARGEST:
-        raise UserError(f"seed={seed} is impossible: it must be a whole number from 0 to {LARGEST}.")
+    check_whole("episodes", episodes, 1, MOST_EPISODES)
+    check_whole("seed", seed, 0)
     run = run if isinstance(run, Run) else Run(run)
     trained, found, states, precision = restore(run, task, agent, best)
     keep_compiled()

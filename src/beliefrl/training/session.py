@@ -28,7 +28,7 @@ from beliefrl.training.evaluation import as_argument
 from beliefrl.training.phases import SeedState
 from beliefrl.training.schedule import Event, Phase, Snapshot, TrainingProgress, stages
 from beliefrl.training.stop import Requests, Stopped
-from beliefrl.types import UserError
+from beliefrl.types import UserError, cause
 
 Callback = Callable[[Event], Any]  # returns True to stop the training
 RENAMED = {".actor.episode_return": ".actor.total"}  # arrays in checkpoints: the present name, the old one
@@ -81,7 +81,7 @@ class Session:
             raise
         except OSError as error:
             raise UserError(
-                f"{self.recorder.folder} cannot be written ({error.strerror or error}): fix that, then "
+                f"{self.recorder.folder} cannot be written ({cause(error)}): fix that, then "
                 f"`beliefrl resume {as_argument(self.recorder)}` goes on."
             ) from None
         return self.recorder

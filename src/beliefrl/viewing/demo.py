@@ -9,7 +9,7 @@ import pathlib
 import zipfile
 
 from beliefrl.runs.run import Run
-from beliefrl.types import UserError, short
+from beliefrl.types import UserError, cause, short
 
 FOLDER = pathlib.Path(__file__).parent / "demos"
 
@@ -41,5 +41,5 @@ def demo(task: str, folder: str | os.PathLike[str]) -> Run:
     except FileExistsError:
         raise UserError(f"{folder} exists already: choose another folder.") from None
     except OSError as error:
-        raise UserError(f"{folder} cannot be made ({error.strerror}): choose another folder.") from None
+        raise UserError(f"{folder} cannot be made ({cause(error)}): choose another folder.") from None
     return Run(folder)

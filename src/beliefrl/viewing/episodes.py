@@ -19,7 +19,7 @@ from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import GymnasiumTask, measure_of
 from beliefrl.training.evaluation import restore_seed
-from beliefrl.types import LARGEST, Timestep, UserError
+from beliefrl.types import LARGEST, Timestep, check_whole
 from beliefrl.viewing import rendering
 from beliefrl.viewing.rendering import Pixels
 
@@ -157,7 +157,5 @@ def play(
 
 def check_episode(episode_seed: int, steps: int | None = None) -> None:
     """Raise a UserError if one of the arguments is out of range."""
-    if not 0 <= episode_seed <= LARGEST:
-        raise UserError(f"episode_seed={episode_seed} is impossible: it must be from 0 to {LARGEST}.")
-    if steps is not None and not 1 <= steps <= LARGEST:
-        raise UserError(f"steps={steps} is impossible: it must be a whole number from 1 to {LARGEST}.")
+    check_whole("episode_seed", episode_seed, 0)
+    check_whole("steps", 1 if steps is None else steps, 1)

@@ -26,7 +26,7 @@ from beliefrl.tasks import Task
 from beliefrl.tasks.drawing import INK, PAPER, Viewer
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.evaluation import restore_seed
-from beliefrl.types import LARGEST, UserError
+from beliefrl.types import LARGEST, UserError, cause, check_whole
 from beliefrl.viewing import rendering
 from beliefrl.viewing.episodes import Frame, Player, Trajectory, check_episode
 from beliefrl.viewing.rendering import Pixels
@@ -73,8 +73,7 @@ def video(
         KeyboardInterrupt: the window was closed.
     """
     check_episode(episode_seed, steps)
-    if not 1 <= episodes <= LARGEST:
-        raise UserError(f"episodes={episodes} is impossible: it must be a whole number of at least 1.")
+    check_whole("episodes", episodes, 1)
     for name, rate in {"fps": fps, "fastest": fastest}.items():
         if rate is not None and not 0 < rate <= 1000:
             raise UserError(f"{name}={rate} is impossible: it must be a number above 0 and up to 1000.")
@@ -161,7 +160,7 @@ def _encoder(path: pathlib.Path, kind: str, fps: float) -> Iterator[Writer]:
 
             yield checked
     except OSError as error:
-        raise UserError(f"{path} cannot be written ({error.strerror or error}): choose another file.") from None
+        raise UserError(f"{path} cannot be written ({cause(error)}): choose another file.") from None
 
 
 @contextmanager
@@ -243,8 +242,7 @@ def film(
         UserError: there is no such run or seed, a number is impossible, or a task cannot be rendered.
     """
     check_episode(episode_seed, steps)
-    if not 2 <= frames <= 100:
-        raise UserError(f"frames={frames} is impossible: it must be a whole number from 2 to 100.")
+    check_whole("frames", frames, 2, 100)
     if not runs:
         raise UserError("RUN is missing: give one or more runs.")
     runs = [run if isinstance(run, Run) else Run(run) for run in runs]

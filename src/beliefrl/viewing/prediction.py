@@ -29,7 +29,7 @@ from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.evaluation import restore_seed
-from beliefrl.types import LARGEST, Timestep, UserError, perception
+from beliefrl.types import Timestep, UserError, check_whole, perception
 from beliefrl.viewing.episodes import Player, check_episode
 
 START = 50  # default number of timesteps that the closed loop observes
@@ -130,9 +130,9 @@ def predictions(
 
 
 def _check_sizes(start: int | None, horizon: int, samples: int) -> None:
-    for name, value, most in (("start", start, LARGEST), ("horizon", horizon, LARGEST), ("samples", samples, 10_000)):
-        if value is not None and not 1 <= value <= most:
-            raise UserError(f"{name}={value} is impossible: it must be a whole number from 1 to {most}.")
+    check_whole("start", 1 if start is None else start, 1)
+    check_whole("horizon", horizon, 1)
+    check_whole("samples", samples, 1, 10_000)
 
 
 def _model(run: Run, agent: Any, model: str | None) -> str:
