@@ -20,7 +20,7 @@ from beliefrl import agents
 from beliefrl.analysis import figures, groups, results
 from beliefrl.analysis.aggregate import BOUNDS
 from beliefrl.analysis.curves import standard_error
-from beliefrl.analysis.palette import colours
+from beliefrl.analysis.panels import colours
 
 AGENTS = ("sac-mlp", "predictive-sac")
 TASK = "pendulum"

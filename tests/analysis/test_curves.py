@@ -5,10 +5,20 @@ import pytest
 from safetensors.numpy import save_file
 
 from beliefrl.analysis.curves import draw_curve, evaluations, standard_error
-from beliefrl.analysis.final import rows, write_final
 from beliefrl.analysis.groups import groups
-from beliefrl.analysis.scalability import COLUMNS, STEPS, cells, costs, wall_clock, write_costs
-from beliefrl.analysis.tables import Column, latex, markdown
+from beliefrl.analysis.tables import (
+    COSTS,
+    TIMED_STEPS,
+    Column,
+    cost_row,
+    costs,
+    final_rows,
+    latex,
+    markdown,
+    wall_clock,
+    write_costs,
+    write_final,
+)
 from beliefrl.cli import main
 from beliefrl.types import UserError
 from written import HOUR, TWO_SEEDS, a_run, flat
@@ -78,7 +88,7 @@ def test_there_is_no_curve_without_evaluations(tmp_path, seeds):
 
 def test_a_row_tells_returns_with_their_spread_and_when_the_task_was_solved(tmp_path):
     made = [a_run(tmp_path / "a", [flat(100, 960, 500), flat(100, 980, 700)], task="cartpole", **HOUR)]
-    ((task, agent, seeds, steps, sampled, mode, solved, time),) = rows(groups(made))
+    ((task, agent, seeds, steps, sampled, mode, solved, time),) = final_rows(groups(made))
     assert (task, agent, seeds, steps) == ("`cartpole`", "`vrm`", "0 to 1", "30")
     assert sampled == "600.0 ± 100.0"
     assert mode == "7.0 ± 0.0"
@@ -88,27 +98,27 @@ def test_a_row_tells_returns_with_their_spread_and_when_the_task_was_solved(tmp_
 
 @pytest.mark.parametrize(("task", "enough"), [("cartpole-p", 955.0), ("target-reaching", 134.0)])
 def test_a_task_is_solved_by_the_mean_over_seeds(tmp_path, task, enough):
-    (row,) = rows(groups([a_run(tmp_path / "a", [flat(-1500, enough)], task=task)]))
+    (row,) = final_rows(groups([a_run(tmp_path / "a", [flat(-1500, enough)], task=task)]))
     assert row[6] == "20"
-    (row,) = rows(groups([a_run(tmp_path / "b", [flat(-1500, enough), flat(-1500, enough - 50)], task=task)]))
+    (row,) = final_rows(groups([a_run(tmp_path / "b", [flat(-1500, enough), flat(-1500, enough - 50)], task=task)]))
     assert row[6] == "no"
 
 
 def test_of_a_task_without_a_known_good_return_nobody_says_that_it_is_solved(tmp_path):
-    (row,) = rows(groups([a_run(tmp_path / "a", [flat(10, 2000)], task="hopper-v")]))
+    (row,) = final_rows(groups([a_run(tmp_path / "a", [flat(10, 2000)], task="hopper-v")]))
     assert row[6] == "-"
 
 
 def test_success_is_shown_where_a_task_has_it_and_an_unknown_time_is_unknown(tmp_path):
     seed = [(10, [1.0, 3.0], [True, False])]
-    (row,) = rows(groups([a_run(tmp_path / "a", [seed], task="target-reaching")]))
+    (row,) = final_rows(groups([a_run(tmp_path / "a", [seed], task="target-reaching")]))
     assert row[4] == "2.0; success 50%"
     assert row[5] == "7.0; success 100%"
     assert row[7] == "unknown"
 
 
 def test_runs_without_an_evaluation_are_not_in_it(tmp_path):
-    assert rows(groups([a_run(tmp_path / "a", [[]])])) == []
+    assert final_rows(groups([a_run(tmp_path / "a", [[]])])) == []
 
 
 def test_the_command_writes_markdown_and_latex(tmp_path, capsys):
@@ -156,13 +166,13 @@ def test_wall_clock_is_the_sum_of_the_sessions(run, tmp_path):
 
 def test_costs_are_of_one_seed(run):
     (cost,) = costs(groups([run]))
-    assert cost.seconds == pytest.approx(100 / 20 / 2 * STEPS)
+    assert cost.seconds == pytest.approx(100 / 20 / 2 * TIMED_STEPS)
     assert cost.parameters == 20  # every array that is saved, whatever its name
     assert cost.steps == 20
 
 
 def test_the_table_is_markdown_and_latex(run, tmp_path):
-    table = COLUMNS, [cells(cost) for cost in costs(groups([run]))]
+    table = COSTS, [cost_row(cost) for cost in costs(groups([run]))]
     assert markdown(*table).splitlines()[-1] == "| sac_mlp | pendulum-v | 69.44 h | 0.00 M | 20 |"
     assert r"sac\_mlp & pendulum-v & 69.44 h & 0.00 M & 20 \\" in latex(*table)
     assert write_costs(groups([run]), tmp_path / "table").read_text() == markdown(*table)
@@ -172,7 +182,7 @@ def test_the_table_is_markdown_and_latex(run, tmp_path):
 def test_what_is_not_known_is_said_to_be_unknown(tmp_path):
     (cost,) = costs(groups([a_run(tmp_path / "a", [flat(1.0)])]))
     assert (cost.seconds, cost.parameters) == (None, None)
-    assert "| unknown | unknown |" in markdown(COLUMNS, [cells(cost)])
+    assert "| unknown | unknown |" in markdown(COSTS, [cost_row(cost)])
 
 
 def test_sessions_that_are_no_sessions_have_no_time(tmp_path):

@@ -5,7 +5,7 @@ import pytest
 
 from beliefrl.analysis import elbo, panels
 from beliefrl.analysis.groups import groups
-from beliefrl.analysis.palette import dashes
+from beliefrl.analysis.panels import dashes
 from beliefrl.sweeps import presets
 from beliefrl.types import UserError
 from written import a_run, flat

@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import t as student
 
 from beliefrl import agents
-from beliefrl.analysis.palette import AGENTS, colours
+from beliefrl.analysis.panels import AGENTS, colours
 from beliefrl.report import write_report
 from beliefrl.report.data import statistics
 from beliefrl.types import UserError

@@ -17,7 +17,7 @@ import beliefrl
 from beliefrl.runs.arrays import write_whole
 from beliefrl.runs.folder import free_folder
 from beliefrl.runs.options import Options
-from beliefrl.runs.provenance import provenance
+from beliefrl.runs.records import provenance
 from beliefrl.runs.run import Recorder, Run
 from beliefrl.types import UserError
 

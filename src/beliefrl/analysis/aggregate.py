@@ -15,8 +15,7 @@ from jaxtyping import Float
 
 from beliefrl.analysis.figures import figure, save
 from beliefrl.analysis.groups import Group
-from beliefrl.analysis.palette import colours
-from beliefrl.analysis.panels import add_legend, counts, legend_height, tasks_of, with_curve
+from beliefrl.analysis.panels import add_legend, colours, counts, legend_height, tasks_of, with_curve
 from beliefrl.types import UserError
 
 Scores = Sequence[Float[np.ndarray, " seed"]]  # one array for each task

@@ -10,8 +10,7 @@ import numpy as np
 
 from beliefrl.analysis.figures import save
 from beliefrl.analysis.groups import Curve, Group
-from beliefrl.analysis.palette import colours
-from beliefrl.analysis.panels import add_legend, draw_line, finish, panels, spread, with_curve
+from beliefrl.analysis.panels import add_legend, colours, draw_line, finish, panels, spread, with_curve
 from beliefrl.analysis.results import MODEL_LOSSES, means_between
 from beliefrl.types import UserError
 

@@ -1,4 +1,9 @@
-"""Learning curves of many agents on many tasks: one panel per task, one line per agent (Section 5, Appendices C, F)."""
+"""Learning curves of many agents on many tasks: one panel per task, one line per agent (Section 5, Appendices C, F).
+
+An agent has the same colour in every figure and report. Lines of one agent with different settings have different
+dashes, too. Colour-blind readers can distinguish the agents' colours (simulated after Machado et al. 2009). Their
+contrast to white is at least 3 to 1.
+"""
 
 import pathlib
 import textwrap
@@ -10,13 +15,24 @@ import numpy as np
 from beliefrl.analysis.curves import axis_label, standard_error
 from beliefrl.analysis.figures import figure, save
 from beliefrl.analysis.groups import Curve, Group
-from beliefrl.analysis.palette import colours, dashes
 from beliefrl.types import UserError
 
 COLUMNS = 3
 PANEL = (3.5, 2.7)  # inches
 HANDLE, LETTER = 0.6, 0.072  # inches: of a legend entry without its label, of a letter
 DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (7, 2, 1.5, 2)), (0, (3, 1, 1, 1, 1, 1)))  # lengths in line widths
+AGENTS = {
+    "vrm": "#0072b2",
+    "sac-mlp": "#d55e00",
+    "sac-lstm": "#009e73",
+    "slac": "#cc79a7",
+    "predictive-sac": "#9a8700",
+    "vrm-single": "#332288",
+    "vrm-first": "#aa3377",
+    "vrm-keep": "#661100",
+    "vrm-deterministic": "#117733",
+}
+OTHERS = ("#777777", "#8f8f1f", "#3c8fc0", "#b37700", "#5e4fa2", "#0f8b8d")
 
 
 def draw_curves(groups: Sequence[Group], out: pathlib.Path, mode: str = "sampled") -> pathlib.Path:
@@ -184,3 +200,35 @@ def pooled(groups: Sequence[Group], drawn: Callable[[int], dict[str, Any]], pape
     if not made:
         raise UserError("These runs are not a sensitivity study: `beliefrl sweep --preset sensitivity` makes one.")
     return made
+
+
+def _plain_first(labels: Sequence[str]) -> list[str]:
+    """The labels without duplicates; names without settings come first."""
+    return sorted(dict.fromkeys(labels), key=lambda label: " " in label)
+
+
+def colours(labels: Sequence[str]) -> dict[str, str]:
+    """A colour "#rrggbb" for each label, whose first word is the agent's name.
+
+    The first label of a known agent has the agent's colour. All others take the colours of OTHERS in turn, in the order
+    of the labels, names without settings first.
+    """
+    chosen: dict[str, str] = {}
+    others = 0
+    for label in _plain_first(labels):
+        own = AGENTS.get(label.partition(" ")[0])
+        if own is None or own in chosen.values():
+            own, others = OTHERS[others % len(OTHERS)], others + 1
+        chosen[label] = own
+    return {label: chosen[label] for label in labels}
+
+
+def dashes(labels: Sequence[str]) -> dict[str, int]:
+    """The index of each label's dash pattern: its position among the labels of its agent, the plain name first."""
+    before: dict[str, int] = {}
+    chosen = {}
+    for label in _plain_first(labels):
+        agent = label.partition(" ")[0]
+        chosen[label] = before.get(agent, 0)
+        before[agent] = chosen[label] + 1
+    return {label: chosen[label] for label in labels}

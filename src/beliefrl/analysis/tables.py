@@ -1,10 +1,23 @@
-"""Tables as files: Markdown for reading and LaTeX for print. No file is left half written."""
+"""Tables as files, Markdown for reading and LaTeX for print: final results, and the cost of training (Appendix G).
 
+No file is left half written.
+"""
+
+import math
 import pathlib
 from collections.abc import Sequence
+from datetime import datetime
 from typing import NamedTuple
 
+import numpy as np
+
+from beliefrl.analysis.aggregate import known_bounds
+from beliefrl.analysis.curves import standard_error
+from beliefrl.analysis.groups import Curve, Group, last_step
+from beliefrl.analysis.panels import counts
+from beliefrl.runs import arrays
 from beliefrl.runs.arrays import write_whole
+from beliefrl.runs.run import Run
 from beliefrl.types import UserError, cause
 
 
@@ -55,3 +68,148 @@ def write_table(columns: Sequence[Column], rows: Sequence[Cells], out: pathlib.P
     except OSError as error:
         raise UserError(f"{out} cannot be written ({cause(error)}): choose another --out.") from None
     return out.with_suffix(".md")
+
+
+SOLVED = 0.95  # score (`aggregate`): a return of -203 on the pendulum, 951 on CartPole, 133 on target reaching
+
+FINAL = (
+    Column("task"),
+    Column("agent"),
+    Column("seeds"),
+    Column("steps", True),
+    Column("sampled actions", True),
+    Column("mode actions", True),
+    Column("solved at", True),
+    Column("wall-clock per seed", True),
+)
+
+
+def final_rows(groups: Sequence[Group]) -> list[tuple[str, ...]]:
+    """One row per agent and task: returns at the last evaluation, mean ± S.E.M. over seeds.
+
+    A task is solved at the first evaluation whose mean over seeds has a score of 0.95, with sampled or mode actions.
+    """
+    table = []
+    for group in groups:
+        sampled, mode = group.curve("sampled"), group.curve("mode")
+        if not sampled.steps.size:
+            continue
+        spans = [wall_clock(run) for run in group.runs]
+        known = [span for span in spans if span is not None]
+        seconds = sum(known) / sum(len(run.seeds) for run in group.runs) if len(known) == len(spans) else None
+        table.append(
+            (
+                f"`{group.task}`",
+                f"`{group.label}`",
+                counts([seed for _, seed in group.seeds]),
+                f"{sampled.steps[-1]:,}",
+                _final(sampled) + _measures(group, "sampled"),
+                _final(mode) + _measures(group, "mode"),
+                _solved(group.task, sampled, mode),
+                "unknown" if seconds is None else hours(seconds),
+            )
+        )
+    return table
+
+
+def _final(curve: Curve) -> str:
+    error = f" ± {standard_error(curve.seeds[:, -1:])[0]:.1f}" if len(curve.seeds) > 1 else ""
+    return f"{np.nanmean(curve.seeds[:, -1]):.1f}{error}"
+
+
+def _measures(group: Group, mode: str) -> str:
+    last = {name: float(np.nanmean(group.curve(f"{mode}_{name}").seeds[:, -1])) for name in group.measures}
+    return "".join(f"; {name} {measure_text(name, value)}" for name, value in last.items())
+
+
+def _solved(task: str, *curves: Curve) -> str:
+    """The first step at which the mean of one of the curves is solved; "-" for a task without known bounds."""
+    known = known_bounds(task)
+    if known is None:
+        return "-"
+    low, high = known
+    enough = np.any([np.nanmean(curve.seeds, axis=0) >= low + SOLVED * (high - low) for curve in curves], axis=0)
+    return f"{curves[0].steps[np.argmax(enough)]:,}" if enough.any() else "no"
+
+
+def write_final(groups: Sequence[Group], out: pathlib.Path) -> pathlib.Path:
+    """Write the table as .md and .tex; returns the path of the first.
+
+    Raises:
+        UserError: the files cannot be written.
+    """
+    return write_table(FINAL, final_rows(groups), out)
+
+
+TIMED_STEPS = 100_000  # as in the paper's table
+
+
+class Cost(NamedTuple):
+    label: str
+    task: str
+    seconds: float | None  # TIMED_STEPS environment steps of one seed, with pre-training and compilation; None: unknown
+    parameters: int | None  # of the networks of one seed; None: no agent was saved
+    steps: int  # environment steps that were timed
+
+
+def wall_clock(run: Run) -> float | None:
+    """Total seconds of a run's sessions; None if a session was killed, so that its end is unknown."""
+    total = 0.0
+    for session in (run.config, *run.config.get("resumed", ())):
+        try:
+            began, ended = (datetime.fromisoformat(session[name]) for name in ("started", "ended"))
+            total += (ended - began).total_seconds()
+        except (KeyError, TypeError, ValueError):
+            return None
+    return total
+
+
+def parameters(run: Run) -> int | None:
+    """The number of parameters in the saved networks of one seed (`Agent.networks`); None if no agent was saved."""
+    path = run.folder / "agent.safetensors"
+    if not path.exists():
+        return None
+    return sum(values.size for values in arrays.load(path).values()) // len(run.seeds)
+
+
+def costs(groups: Sequence[Group]) -> list[Cost]:
+    """The cost of each group; the time is the median over its runs."""
+    table = []
+    for group in groups:
+        spans = [(wall_clock(run), max(last_step(run, seed) for seed in run.seeds), run) for run in group.runs]
+        timed = [span / steps / len(run.seeds) for span, steps, run in spans if span is not None and steps]
+        sizes = [size for run in group.runs if (size := parameters(run)) is not None]
+        seconds = float(np.median(timed)) * TIMED_STEPS if timed else None
+        steps = max((steps for _, steps, _ in spans), default=0)
+        table.append(Cost(group.label, group.task, seconds, sizes[0] if sizes else None, steps))
+    return table
+
+
+COSTS = (
+    Column("agent"),
+    Column("task"),
+    Column(f"wall-clock time ({TIMED_STEPS:,} steps)", True),
+    Column("parameters", True),
+    Column("steps timed", True),
+)
+
+
+def cost_row(cost: Cost) -> tuple[str, ...]:
+    """The row of the table, as text."""
+    time = "unknown" if cost.seconds is None else hours(cost.seconds)
+    size = "unknown" if cost.parameters is None else f"{cost.parameters / 1e6:.2f} M"
+    return (cost.label, cost.task, time, size, f"{cost.steps:,}")
+
+
+def hours(seconds: float) -> str:
+    """A time as text: "1.25 h", or "3.2 min"."""
+    return f"{seconds / 3600:.2f} h" if seconds >= 600 else f"{math.ceil(seconds / 6) / 10:.1f} min"
+
+
+def write_costs(groups: Sequence[Group], out: pathlib.Path) -> pathlib.Path:
+    """Write the table as .md and .tex; returns the path of the first.
+
+    Raises:
+        UserError: the files cannot be written.
+    """
+    return write_table(COSTS, [cost_row(cost) for cost in costs(groups)], out)

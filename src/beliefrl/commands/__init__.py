@@ -13,7 +13,7 @@ COMMANDS: dict[str, str] = {  # module:function, imported when it is called
     "show": "runs:show",
     "evaluate": "runs:evaluate",
     "export": "runs:export",
-    "report": "report:report",
+    "report": "figure:report",
     "predict": "pictures:predict",
     "video": "pictures:video",
     "film": "pictures:film",

@@ -40,7 +40,7 @@ def bench(argv: Sequence[str]) -> None:
     elif name == "all":
         from rich.console import Console
 
-        from beliefrl.commands.tables import scalability_table
+        from beliefrl.training.display import scalability_table
 
         Console().print(scalability_table(results, options.obs, options.actions))
     else:

@@ -1,4 +1,4 @@
-"""`beliefrl figure`."""
+"""`beliefrl figure` and `beliefrl report`: many runs in figures, tables and one page."""
 
 import dataclasses
 import fnmatch
@@ -76,7 +76,7 @@ def figure(argv: Sequence[str]) -> None:
 def _draw(kind: str, runs: Sequence[Any], out: pathlib.Path, actions: str) -> pathlib.Path:
     """Write the figure or table; returns the path of the PNG or of the Markdown file."""
     from beliefrl import agents
-    from beliefrl.analysis import aggregate, elbo, final, panels, scalability
+    from beliefrl.analysis import aggregate, elbo, panels, tables
     from beliefrl.analysis.curves import curve_figure
     from beliefrl.analysis.figures import save
     from beliefrl.analysis.groups import groups
@@ -91,7 +91,7 @@ def _draw(kind: str, runs: Sequence[Any], out: pathlib.Path, actions: str) -> pa
         return save(curve_figure(runs[0]), out)
     lines = groups(runs, agents.defaults())
     if kind in TABLES:
-        return (scalability.write_costs if kind == "scalability" else final.write_final)(lines, out)
+        return (tables.write_costs if kind == "scalability" else tables.write_final)(lines, out)
     if kind == "elbo":
         return elbo.draw_elbo(lines, out, actions)
     if kind == "aggregate":
@@ -131,3 +131,28 @@ def _is_chosen(run: Any, options: FigureOptions, kind: str) -> bool:
         and (not options.names or any(fnmatch.fnmatchcase(name, pattern) for pattern in options.names))
         and (kind != "ablation" or agent.startswith("vrm"))
     )
+
+
+@dataclasses.dataclass(frozen=True)
+class ReportOptions:
+    """Write a report on runs as one HTML page: curves, final returns, settings, time. It needs no network."""
+
+    runs: Annotated[
+        tyro.conf.Positional[tuple[pathlib.Path, ...]], tyro.conf.arg(metavar="RUNS", help_behavior_hint="(required)")
+    ]
+    """Folders of runs, folders that contain runs (such as a sweep's), or files of results, NAME.json.gz."""
+    out: Annotated[pathlib.Path, tyro.conf.arg(aliases=["-o"])] = pathlib.Path("report.html")
+    """The page to write. An existing file is replaced. Links to videos are relative to the page's folder."""
+    unfinished: bool = False
+    """Include unfinished runs in curves and tables, up to their last evaluation. Otherwise they are only listed."""
+
+
+def report(argv: Sequence[str]) -> None:
+    """`beliefrl report RUNS -o report.html`."""
+    options = parse(ReportOptions, argv, "beliefrl report")
+    if not options.runs:
+        raise UsageError("RUNS is missing: give runs, folders that contain runs, or files of results.")
+    from beliefrl.report import write_report
+
+    path = write_report(options.runs, options.out, options.unfinished, lambda sentence: print(f"damaged: {sentence}"))
+    print(f"written to {path}: open it in a browser")

@@ -57,9 +57,8 @@ def show(argv: Sequence[str]) -> None:
     from rich.console import Console
 
     from beliefrl.agents import is_own
-    from beliefrl.commands.tables import run_table
     from beliefrl.runs.run import Run
-    from beliefrl.training.display import results_table
+    from beliefrl.training.display import results_table, run_table
     from beliefrl.training.evaluation import agent_of
 
     run, console = Run(options.run), Console()

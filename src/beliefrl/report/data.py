@@ -13,9 +13,9 @@ import numpy as np
 from beliefrl import agents
 from beliefrl.analysis.curves import standard_error
 from beliefrl.analysis.groups import Curve, Group, groups, is_finished, last_step
-from beliefrl.analysis.palette import colours, dashes
+from beliefrl.analysis.panels import colours, dashes
 from beliefrl.analysis.results import changed
-from beliefrl.analysis.scalability import wall_clock
+from beliefrl.analysis.tables import wall_clock
 from beliefrl.runs.run import Row, Run
 from beliefrl.training.evaluation import MODES
 

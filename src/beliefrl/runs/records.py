@@ -1,13 +1,21 @@
-"""The JSON in a run's folder: logs, read line by line, and checks of the content.
+"""The JSON in a run's folder: logs, read line by line, checks of the content, and the provenance in config.json.
 
 A damaged file must cause a UserError and no traceback. So the keys and types that readers need are checked here. The
 ranges of options are checked by `Options`, and those of hyperparameters by the agents.
 """
 
 import json
+import os
 import pathlib
+import platform
+import subprocess
+import sys
 from collections.abc import Iterator
+from datetime import UTC, datetime
+from importlib import metadata
 from typing import Any
+
+import jax
 
 from beliefrl.types import LARGEST, UserError, cause
 
@@ -171,3 +179,36 @@ def _is_mode(mode: Any, seeds: int) -> bool:
 def _are_known(values: Any) -> bool:
     """Whether this is a list of numbers, or None for what a seed does not have."""
     return isinstance(values, list) and all(value is None or _is_number(value) for value in values)
+
+
+PACKAGES = ("beliefrl", "jax", "jaxlib", "equinox", "optax", "numpy")
+
+
+def provenance() -> dict[str, Any]:
+    """The record of this process in a run's config."""
+    return {
+        "versions": {"python": platform.python_version()} | {name: metadata.version(name) for name in PACKAGES},
+        "device": str(jax.devices()[0].device_kind),
+        "git_commit": _git_commit(),
+        "command": [os.path.basename(sys.argv[0]), *sys.argv[1:]],
+        "started": now(),
+    }
+
+
+def now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def _git_commit() -> str | None:
+    """The commit of the running code, with a + if there are uncommitted changes; None outside a git checkout."""
+    try:
+        found = subprocess.run(
+            ["git", "describe", "--always", "--abbrev=40", "--dirty=+", "--match="],
+            cwd=pathlib.Path(__file__).parent,
+            capture_output=True,
+            text=True,
+            timeout=10,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return found.stdout.strip() or None

@@ -29,8 +29,7 @@ from beliefrl.runs.arrays import write_whole
 from beliefrl.runs.best import BEST
 from beliefrl.runs.folder import locked, make, write_config
 from beliefrl.runs.options import Options
-from beliefrl.runs.provenance import now
-from beliefrl.runs.records import Row
+from beliefrl.runs.records import Row, now
 from beliefrl.runs.trackers import Tracker
 from beliefrl.types import UserError, cause, tuples
 

@@ -90,7 +90,7 @@ def reporting(folder: pathlib.Path, report: Report | None, progress: bool) -> It
     with contextlib.ExitStack() as stack:
         listeners = [] if report is None else [report]
         if progress:
-            from beliefrl.sweeps.display import SweepDisplay
+            from beliefrl.sweeps.progress import SweepDisplay
             from beliefrl.training.screen import screen
 
             listeners.insert(0, stack.enter_context(SweepDisplay(screen(), folder)))

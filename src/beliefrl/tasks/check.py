@@ -15,8 +15,7 @@ from rich.text import Text
 from beliefrl import tasks
 from beliefrl.tasks.environment import TaskEnvironment
 from beliefrl.tasks.gymnasium import ENDLESS, GymnasiumTask
-from beliefrl.tasks.labels import action_names, observation_names
-from beliefrl.tasks.spaces import check_actions, flat_bounds, flat_size
+from beliefrl.tasks.spaces import action_names, check_actions, flat_bounds, flat_size, observation_names
 from beliefrl.types import LARGEST, UserError, check_whole, short
 
 SCALES = 100.0  # entries whose largest magnitudes differ by more than this factor cause a warning

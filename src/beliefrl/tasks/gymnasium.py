@@ -15,8 +15,7 @@ from gymnasium import spaces
 
 from beliefrl.catalogue import our_task_names
 from beliefrl.tasks.faults import NONE, STREAM, Draws, Faults
-from beliefrl.tasks.labels import observation_names
-from beliefrl.tasks.spaces import check_actions, flat_bounds, flat_size, limits
+from beliefrl.tasks.spaces import check_actions, flat_bounds, flat_size, limits, observation_names
 from beliefrl.types import LARGEST, Spec, UserError, as_array, check_indices, check_range, said, short
 
 ENDLESS = 10_000  # steps after which an episode without a time limit is considered endless

@@ -12,7 +12,7 @@ from beliefrl.agents import Agent, hyperparameters
 from beliefrl.runs import trackers
 from beliefrl.runs.checkpoint import listed, was_ever_written
 from beliefrl.runs.folder import free_folder
-from beliefrl.runs.provenance import provenance
+from beliefrl.runs.records import provenance
 from beliefrl.runs.run import Recorder, Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import GymnasiumTask
