@@ -19,7 +19,7 @@ import beliefrl
 from beliefrl import agents
 from beliefrl.analysis import figures, groups, results
 from beliefrl.analysis.aggregate import BOUNDS
-from beliefrl.analysis.curves import standard_error
+from beliefrl.analysis.figures import standard_error
 from beliefrl.analysis.panels import colours
 
 AGENTS = ("sac-mlp", "predictive-sac")

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from beliefrl.agents import Agent
     from beliefrl.agents import make as make_agent
     from beliefrl.agents.hyperparameters import Range
-    from beliefrl.analysis.curves import draw_curve
+    from beliefrl.analysis.figures import draw_curve
     from beliefrl.policy import Policy, load
     from beliefrl.report import write_report
     from beliefrl.runs.options import Options
@@ -117,7 +117,7 @@ _HOMES = {
     "WindowShape": "types:WindowShape",
     "check": "tasks.check:check",
     "demo": "viewing.demo:demo",
-    "draw_curve": "analysis.curves:draw_curve",
+    "draw_curve": "analysis.figures:draw_curve",
     "draw_predictions": "viewing.prediction:draw_predictions",
     "evaluate": "training.evaluation:evaluate",
     "film": "viewing.films:film",

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from beliefrl.analysis.curves import draw_curve, evaluations, standard_error
+from beliefrl.analysis.figures import draw_curve, evaluations, standard_error
 from beliefrl.analysis.groups import groups
 from beliefrl.analysis.tables import (
     COSTS,

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from beliefrl.analysis import elbo, panels
+from beliefrl.analysis import panels
 from beliefrl.analysis.groups import groups
 from beliefrl.analysis.panels import dashes
-from beliefrl.sweeps import presets
+from beliefrl.sweeps import sources
 from beliefrl.types import UserError
 from written import a_run, flat
 
@@ -90,10 +90,10 @@ def test_nothing_to_draw_is_an_error(tmp_path):
 def test_the_models_loss_is_the_mean_since_the_evaluation_before(tmp_path, drawn):
     updates = [(5, {"negative_elbo": 8.0}), (10, {"negative_elbo": 6.0}), (15, {"negative_elbo": 1.0})]
     (group,) = groups([a_run(tmp_path / "a", [flat(1.0, 2.0)], updates=updates)])
-    loss = elbo.model_loss(group)
+    loss = panels.model_loss(group)
     np.testing.assert_array_equal(loss.steps, [10, 20])
     np.testing.assert_array_equal(loss.seeds, [[7.0, 1.0]])
-    elbo.draw_elbo([group], tmp_path / "picture")
+    panels.draw_elbo([group], tmp_path / "picture")
     left, right = drawn[0].axes
     np.testing.assert_array_equal(left.lines[0].get_ydata(), [1.0, 2.0])
     np.testing.assert_array_equal(right.lines[0].get_ydata(), [7.0, 1.0])
@@ -101,18 +101,18 @@ def test_the_models_loss_is_the_mean_since_the_evaluation_before(tmp_path, drawn
 
 def test_agents_without_a_model_have_no_such_figure(two_tasks, tmp_path):
     with pytest.raises(UserError, match="model that keeps learning"):
-        elbo.draw_elbo(two_tasks, tmp_path / "picture")
+        panels.draw_elbo(two_tasks, tmp_path / "picture")
 
 
 def test_sensitivity_compares_the_papers_settings_with_those_drawn_for_each_seed(tmp_path):
     runs = []
     for seed in range(6):
-        runs.append(a_run(tmp_path / f"papers-{seed}", [flat(1.0)], first=seed, settings=presets.PAPERS))
-        if presets.drawn(seed) != presets.PAPERS:
-            runs.append(a_run(tmp_path / f"drawn-{seed}", [flat(2.0)], first=seed, settings=presets.drawn(seed)))
-    runs.append(a_run(tmp_path / "other", [flat(3.0)], first=99, settings={**presets.PAPERS, "seq_len": 7}))
-    usual, other = panels.pooled(groups(runs), presets.drawn, presets.PAPERS)
+        runs.append(a_run(tmp_path / f"papers-{seed}", [flat(1.0)], first=seed, settings=sources.PAPERS))
+        if sources.drawn(seed) != sources.PAPERS:
+            runs.append(a_run(tmp_path / f"drawn-{seed}", [flat(2.0)], first=seed, settings=sources.drawn(seed)))
+    runs.append(a_run(tmp_path / "other", [flat(3.0)], first=99, settings={**sources.PAPERS, "seq_len": 7}))
+    usual, other = panels.pooled(groups(runs), sources.drawn, sources.PAPERS)
     assert [seed for _, seed in usual.seeds] == list(range(6))
     assert sorted(seed for _, seed in other.seeds) == list(range(6))
     with pytest.raises(UserError, match="not a sensitivity study"):
-        panels.pooled(groups(runs[-1:]), presets.drawn, presets.PAPERS)
+        panels.pooled(groups(runs[-1:]), sources.drawn, sources.PAPERS)

@@ -9,7 +9,7 @@ import pytest
 
 from beliefrl import agents, cli
 from beliefrl.analysis import groups, results
-from beliefrl.analysis.elbo import draw_elbo, model_loss
+from beliefrl.analysis.panels import draw_elbo, model_loss
 from beliefrl.report import write_report
 from beliefrl.types import UserError
 from written import HOUR, a_folder, a_run, flat

@@ -3,7 +3,7 @@
 import pytest
 
 from beliefrl import cli
-from beliefrl.sweeps import presets, run
+from beliefrl.sweeps import run, sources
 from written import a_run, flat
 
 
@@ -78,7 +78,7 @@ def test_the_first_seed_can_be_given_alone(asked, tmp_path):
     usual, *other = experiments(asked, "--preset sensitivity --tasks pendulum --seed 3")
     assert usual.seeds == tuple(range(3, 23))
     for each in other:  # the settings are still those that are drawn for the seed
-        assert presets.drawn(each.seeds[0]).items() <= each.settings.items()
+        assert sources.drawn(each.seeds[0]).items() <= each.settings.items()
     lines = (
         "import beliefrl",
         "experiments = [beliefrl.Experiment('vrm', 'pendulum', seeds=s) for s in ([4, 2], [3])]",

@@ -8,9 +8,9 @@ import pytest
 from beliefrl import tasks
 from beliefrl.runs.run import Recorder
 from beliefrl.sweeps import plan as plans
-from beliefrl.sweeps import presets
-from beliefrl.sweeps.files import load, read, write
+from beliefrl.sweeps import sources
 from beliefrl.sweeps.plan import Experiment, extended, grid, plan, shrunk
+from beliefrl.sweeps.sources import load, read, write
 from beliefrl.types import UserError
 
 
@@ -223,33 +223,33 @@ def test_a_file_makes_experiments(tmp_path):
     [("classic", 24, 5), ("robots", 36, 5), ("memory", 4, 5), ("ablation", 80, 5), ("scalability", 4, 1)],
 )
 def test_presets_are_the_papers_experiments(name, lines, seeds):
-    made = presets.preset(name)
+    made = sources.preset(name)
     assert len(made) == lines
     assert all(len(each.seeds) == seeds for each in made)
     assert {each.task for each in made} <= set(tasks.names())
     for each in made:
-        assert each.agent in presets.COMPARED + presets.ABLATIONS
+        assert each.agent in sources.COMPARED + sources.ABLATIONS
 
 
 def test_the_sensitivity_study_draws_settings_for_each_of_twenty_seeds():
-    made = presets.preset("sensitivity", ["pendulum"])
+    made = sources.preset("sensitivity", ["pendulum"])
     usual, *other = made
     assert len(usual.seeds) == 20
     for each in other:
         (seed,) = each.seeds
         assert each.settings["seq_len"] * each.settings["batch_size"] == 256
-        assert {name: each.settings[name] for name in presets.PAPERS} == presets.drawn(seed)
-    same = [seed for seed in range(20) if presets.drawn(seed) == presets.PAPERS]
+        assert {name: each.settings[name] for name in sources.PAPERS} == sources.drawn(seed)
+    same = [seed for seed in range(20) if sources.drawn(seed) == sources.PAPERS]
     assert len(other) == 20 - len(same)
-    assert len({tuple(presets.drawn(seed).items()) for seed in range(20)}) > 6
+    assert len({tuple(sources.drawn(seed).items()) for seed in range(20)}) > 6
     plan(made)
 
 
 def test_a_preset_takes_other_tasks_agents_and_seeds():
-    made = presets.preset("classic", ["target-reaching"], ["vrm"], [8])
+    made = sources.preset("classic", ["target-reaching"], ["vrm"], [8])
     assert [(each.agent, each.task, tuple(each.seeds)) for each in made] == [("vrm", "target-reaching", (8,))]
     with pytest.raises(UserError, match="no preset 'paper'"):
-        presets.preset("paper")
+        sources.preset("paper")
 
 
 def test_the_options_that_a_sweep_knows_are_those_of_a_training():

@@ -138,7 +138,7 @@ def test_a_sweep_that_cannot_be_planned_closes_its_launcher(tmp_path, monkeypatc
         raise OSError(28, "No space left on device")
 
     closed = []
-    monkeypatch.setattr(runs.files, "write", full)
+    monkeypatch.setattr(runs.sources, "write", full)
     monkeypatch.setattr(Pretence, "stop", lambda self: closed.append(self))
     with pytest.raises(OSError, match="No space left"):
         sweep(TWO, tmp_path)

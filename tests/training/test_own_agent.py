@@ -12,7 +12,7 @@ import pytest
 
 import beliefrl
 from beliefrl.agents.vrm import VRMAgent
-from beliefrl.analysis.curves import curve_figure
+from beliefrl.analysis.figures import curve_figure
 from beliefrl.analysis.tables import parameters
 from beliefrl.models.nets import Gaussian
 from beliefrl.runs import arrays

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from beliefrl import agents, load, resume, train
-from beliefrl.analysis.curves import draw_curve, evaluations
+from beliefrl.analysis.figures import draw_curve, evaluations
 from beliefrl.analysis.groups import is_finished
 from beliefrl.cli import main
 from beliefrl.runs.arrays import load as load_arrays

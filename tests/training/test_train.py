@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from beliefrl import agents
-from beliefrl.analysis.curves import draw_curve
+from beliefrl.analysis.figures import draw_curve
 from beliefrl.runs.run import Run
 
 TRAIN = "train vrm pendulum-v"

@@ -1,10 +1,17 @@
-"""Figures as files: a PNG for the screen and a PDF for print. No file is left half written."""
+"""Figures as files, a PNG for the screen and a PDF for print; and the learning curve of one run (Figures 4 and 6).
+
+No file is left half written.
+"""
 
 import io
 import pathlib
 from typing import Any
 
+import numpy as np
+
+from beliefrl.analysis.groups import Curve, Group, task_of
 from beliefrl.runs.arrays import write_whole
+from beliefrl.runs.run import Run
 from beliefrl.types import UserError, cause
 
 KINDS = (".png", ".pdf")
@@ -58,3 +65,68 @@ def save(figure: Any, path: pathlib.Path) -> pathlib.Path:
         except OSError as error:
             raise UserError(f"{name} cannot be written ({cause(error)}): choose another file.") from None
     return paths(path)[0]
+
+
+COLOURS = {"sampled": "#1f6f8b", "mode": "#c8553d"}
+
+
+def evaluations(run: Run, name: str) -> Curve:
+    """An entry of the evaluations of all seeds of a run, as in `Group.curve`."""
+    return Group(task_of(run), run.config["agent"], [(run, seed) for seed in run.seeds]).curve(name)
+
+
+def axis_label(measure: str) -> str:
+    """The label of an axis for a measure; "" is the return."""
+    return {"": "return", "success": "success rate"}.get(measure, measure)
+
+
+def standard_error(seeds: np.ndarray) -> np.ndarray:
+    """S.E.M. over the first axis, ignoring NaN; 0 if there is only one value."""
+    count = np.sum(~np.isnan(seeds), axis=0)
+    squares = np.nansum((seeds - np.nanmean(seeds, axis=0)) ** 2, axis=0)
+    return np.where(count > 1, np.sqrt(squares / np.maximum(count - 1, 1) / np.maximum(count, 1)), 0.0)
+
+
+def draw_curve(run: Run, path: pathlib.Path | str | None = None) -> pathlib.Path:
+    """Draw a run's evaluation returns over environment steps; returns the path of the picture.
+
+    Each measure of the task, such as success, has another panel. Each seed is a thin line, the mean a thick
+    line, and the S.E.M. a band. Without `path` the picture is curve.png in the run's folder.
+
+    Raises:
+        UserError: there is no evaluation yet.
+    """
+    path = pathlib.Path(path or run.folder / "curve.png")
+    curve_figure(run).savefig(path, dpi=150)
+    return path
+
+
+def curve_figure(run: Run) -> Any:
+    """The figure that `draw_curve` writes.
+
+    Raises:
+        UserError: there is no evaluation yet.
+    """
+    group = Group(task_of(run), run.config["agent"], [(run, seed) for seed in run.seeds])
+    if not group.curve("sampled").steps.size:
+        raise UserError(f"{run.folder} has no evaluation of every seed yet, so there is no curve to draw.")
+    panels = ["", *group.measures]
+    made = figure(5.6 * len(panels), 3.6)
+    axes = made.subplots(1, len(panels), squeeze=False)[0]
+    for axis, measure in zip(axes, panels, strict=True):
+        for mode, colour in COLOURS.items():
+            steps, seeds = group.curve(f"{mode}_{measure}" if measure else mode)
+            mean, error = np.nanmean(seeds, axis=0), standard_error(seeds)
+            for seed in seeds if len(seeds) > 1 else []:
+                axis.plot(steps, seed, color=colour, linewidth=0.6, alpha=0.4)
+            axis.plot(steps, mean, color=colour, linewidth=2, label=f"{mode} actions", marker="o", markersize=3)
+            axis.fill_between(steps, mean - error, mean + error, color=colour, alpha=0.2, linewidth=0)
+        axis.set_xlabel("environment steps")
+        axis.set_ylabel(axis_label(measure))
+        axis.grid(alpha=0.25)
+        axis.spines[["top", "right"]].set_visible(False)
+    count = len(run.seeds)
+    spread = f"mean and S.E.M. of {count} seeds" if count > 1 else "1 seed"
+    axes[0].set_title(f"{run.config['agent']} on {run.config['task']}, {spread}", loc="left", fontsize=10)
+    axes[0].legend(frameon=False, loc="best", fontsize=9)
+    return made

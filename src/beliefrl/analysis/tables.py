@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from beliefrl.analysis.aggregate import known_bounds
-from beliefrl.analysis.curves import standard_error
+from beliefrl.analysis.figures import standard_error
 from beliefrl.analysis.groups import Curve, Group, last_step
 from beliefrl.analysis.panels import counts
 from beliefrl.runs import arrays

@@ -76,11 +76,10 @@ def figure(argv: Sequence[str]) -> None:
 def _draw(kind: str, runs: Sequence[Any], out: pathlib.Path, actions: str) -> pathlib.Path:
     """Write the figure or table; returns the path of the PNG or of the Markdown file."""
     from beliefrl import agents
-    from beliefrl.analysis import aggregate, elbo, panels, tables
-    from beliefrl.analysis.curves import curve_figure
-    from beliefrl.analysis.figures import save
+    from beliefrl.analysis import aggregate, panels, tables
+    from beliefrl.analysis.figures import curve_figure, save
     from beliefrl.analysis.groups import groups
-    from beliefrl.sweeps import presets
+    from beliefrl.sweeps import sources
     from beliefrl.types import UserError
 
     if kind == "run":
@@ -93,11 +92,11 @@ def _draw(kind: str, runs: Sequence[Any], out: pathlib.Path, actions: str) -> pa
     if kind in TABLES:
         return (tables.write_costs if kind == "scalability" else tables.write_final)(lines, out)
     if kind == "elbo":
-        return elbo.draw_elbo(lines, out, actions)
+        return panels.draw_elbo(lines, out, actions)
     if kind == "aggregate":
         return aggregate.draw_aggregate(lines, out, actions)
     if kind == "sensitivity":
-        lines = panels.pooled(lines, presets.drawn, presets.PAPERS)
+        lines = panels.pooled(lines, sources.drawn, sources.PAPERS)
     return panels.draw_curves(lines, out, actions)
 
 

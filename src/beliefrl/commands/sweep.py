@@ -73,7 +73,7 @@ def sweep(argv: Sequence[str]) -> None:
 def _experiments(options: SweepOptions) -> list:
     """The experiments that the options define. Empty: continue the sweep in --out."""
     from beliefrl.runs.options import Options
-    from beliefrl.sweeps import files, plan, presets
+    from beliefrl.sweeps import plan, sources
     from beliefrl.types import check_range, check_whole
 
     check_range(options, ("scale",), 0, 1)
@@ -85,17 +85,17 @@ def _experiments(options: SweepOptions) -> list:
     if options.file is not None:
         if options.preset or options.agents or options.tasks:
             raise UsageError("FILE defines the agents and tasks: leave --preset, --agents and --tasks out.")
-        chosen = files.load(options.file)
+        chosen = sources.load(options.file)
         if count is not None:
             chosen = [dataclasses.replace(each, seeds=tuple(range(first, first + count))) for each in chosen]
         elif options.seed is not None:
             chosen = _shifted(chosen, first)
     elif options.preset is not None:
-        numbers = range(first, first + (count or presets.PRESETS[options.preset].seeds))
-        chosen = presets.preset(options.preset, options.tasks, options.agents, numbers)
+        numbers = range(first, first + (count or sources.PRESETS[options.preset].seeds))
+        chosen = sources.preset(options.preset, options.tasks, options.agents, numbers)
     elif options.agents and options.tasks:
         chosen = plan.grid(options.agents, options.tasks, seeds=range(first, first + (count or 5)))
-    elif options.out is not None and _only_continues(options) and files.read(options.out):
+    elif options.out is not None and _only_continues(options) and sources.read(options.out):
         return []
     else:
         raise UsageError(

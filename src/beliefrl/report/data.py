@@ -11,7 +11,7 @@ from urllib.parse import quote
 import numpy as np
 
 from beliefrl import agents
-from beliefrl.analysis.curves import standard_error
+from beliefrl.analysis.figures import standard_error
 from beliefrl.analysis.groups import Curve, Group, groups, is_finished, last_step
 from beliefrl.analysis.panels import colours, dashes
 from beliefrl.analysis.results import changed

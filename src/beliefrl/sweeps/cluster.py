@@ -13,9 +13,9 @@ import sys
 import time
 from typing import Any
 
-from beliefrl.sweeps.files import PLAN
 from beliefrl.sweeps.local import environment, open_log
 from beliefrl.sweeps.plan import Training
+from beliefrl.sweeps.sources import PLAN
 from beliefrl.types import UserError
 
 RETRIES = 3  # restarts of a training whose machine is lost

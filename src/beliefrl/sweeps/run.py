@@ -9,7 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from beliefrl import agents
 from beliefrl.runs.folder import locked
-from beliefrl.sweeps import cluster, files, local
+from beliefrl.sweeps import cluster, local, sources
 from beliefrl.sweeps import plan as plans
 from beliefrl.sweeps.plan import Experiment, Training
 from beliefrl.sweeps.progress import SweepStatus
@@ -63,7 +63,7 @@ def sweep(
     folder = pathlib.Path(out)
     plans.plan(experiments)  # raise errors before a folder is made
     with lock(folder):
-        before = files.read(folder)
+        before = sources.read(folder)
         _check_named(folder, before, experiments)
         slots = [] if ray else ["-"] if workers == 0 else local.slots(workers)
         launcher = cluster.Cluster(folder, ray, workers) if ray else local.Local(folder, slots)
@@ -108,7 +108,7 @@ def _check_named(folder: pathlib.Path, before: Sequence[Training], experiments: 
 
 def _status(folder: pathlib.Path, trainings: Sequence[Training]) -> SweepStatus:
     """The state of a sweep with these trainings, which are written to its folder."""
-    files.write(folder, trainings)
+    sources.write(folder, trainings)
     finished = [training for training in trainings if training.is_finished(folder)]
     return SweepStatus(finished, [training for training in trainings if training not in finished])
 

@@ -10,7 +10,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
 
-from beliefrl.analysis.curves import curve_figure
+from beliefrl.analysis.figures import curve_figure
 from beliefrl.analysis.tables import measure_text
 from beliefrl.runs.best import evaluations
 from beliefrl.runs.checkpoint import listed

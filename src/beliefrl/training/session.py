@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from beliefrl.agents import Agent
-from beliefrl.analysis.curves import draw_curve
+from beliefrl.analysis.figures import draw_curve
 from beliefrl.runs.checkpoint import Checkpoints
 from beliefrl.runs.options import Options
 from beliefrl.runs.run import Recorder, Run
