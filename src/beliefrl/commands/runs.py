@@ -84,7 +84,7 @@ def evaluate(argv: Sequence[str]) -> None:
     agent, shown = own_agent(options.agent), not options.json
     results = play(run, options.episodes, options.seed, agent=agent, progress=shown, best=options.best)
     if options.json:
-        print(json.dumps(results))
+        print(json.dumps(json.loads(json.dumps(results), parse_constant=lambda _: None)))  # null for a diverged seed
         return
     which = ", best agents" if options.best else ""
     title = f"{run.config['agent']} on {run.config['task']}, {options.episodes} episodes per seed{which}"

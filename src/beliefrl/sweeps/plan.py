@@ -43,7 +43,7 @@ class Experiment:
     (`beliefrl.Faults`) such as noise."""
     seeds: Sequence[int] = (0, 1, 2, 3, 4)
     """The seed numbers; the paper uses 5 seeds (Appendix B)."""
-    observe: Sequence[int | str] = ()
+    observe: Sequence[int | str] | int | str = ()
     """Entries of the observation that the agent sees, as in `make_task`; empty: all."""
     constants: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """The task's constants, as in `make_task`."""
@@ -205,7 +205,8 @@ def _training(experiment: Experiment, first: int, count: int) -> Training:
     settings, options, faults = _split(experiment.settings)
     named = [*settings.items(), *experiment.constants.items(), *faults.items()]
     changed = [f"{name}={_as_text(value)}" for name, value in named]
-    seen = [f"observe={_as_text(experiment.observe)}"] if experiment.observe else []
+    observe = (experiment.observe,) if isinstance(experiment.observe, int | str) else tuple(experiment.observe)
+    seen = [f"observe={_as_text(observe)}"] if observe else []
     seeds = f"seed{first}" + (f"to{first + count - 1}" if count > 1 else "")
     name = re.sub(r"[^\w.=,-]+", "-", "-".join([experiment.agent, experiment.task, *changed, *seen]))
     if len(name) > LONGEST_NAME:
@@ -217,7 +218,7 @@ def _training(experiment: Experiment, first: int, count: int) -> Training:
         experiment.task,
         settings,
         options,
-        tuple(map(str, experiment.observe)),
+        tuple(map(str, observe)),
         dict(experiment.constants),
         faults,
     )

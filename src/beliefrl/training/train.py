@@ -212,7 +212,7 @@ def _check_possible(options: Options, task: Any, own_process: bool) -> None:
 def _check_same(run: Run, config: dict[str, Any]) -> None:
     """Raise a UserError if a run was trained with other settings than those of `config`, except CHANGEABLE options."""
     asked = {name: config.get(name) for name in ("agent", "task", "constants", "observe", "faults")}
-    asked = asked | config["options"] | config["hyperparameters"]
+    asked |= config["options"] | hyperparameters.recorded(config["hyperparameters"])
     asked = json.loads(json.dumps(asked, default=str))  # tuples are lists in the run's config
     before = {"faults": None} | dataclasses.asdict(Options())  # what an older version did not record, it did not have
     there = before | run.config | run.config["options"] | run.config["hyperparameters"]
