@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from agents.random_windows import SPEC, along, changed_where_missing, differ, random_like, slope, windows
 from beliefrl.agents.sac_lstm import SACLSTMAgent
 from beliefrl.agents.sac_mlp import SACMLPAgent
 from beliefrl.models.nets import LSTM, draw
 from beliefrl.models.soft_actor_critic import actor_loss, q_loss, state_value, value_loss
 from beliefrl.types import UserError
+from inputs import SPEC, along, changed_where_missing, differ, random_like, slope, windows
 
 MLP = SACMLPAgent(policy_layers=(8, 8), value_layers=(8, 8), batch_size=6)
 STANDARDISED = dataclasses.replace(MLP, standardise=True)

@@ -14,7 +14,7 @@ from beliefrl.analysis.tables import Column, latex, markdown
 from beliefrl.cli import main
 from beliefrl.sweeps import presets
 from beliefrl.types import UserError
-from written import HOUR, TWO_SEEDS, a_run, flat
+from inputs import HOUR, TWO_SEEDS, a_run, flat
 
 
 def with_success(seeds):

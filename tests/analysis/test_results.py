@@ -12,7 +12,7 @@ from beliefrl.analysis import groups, results
 from beliefrl.analysis.elbo import draw_elbo, model_loss
 from beliefrl.report import write_report
 from beliefrl.types import UserError
-from written import HOUR, a_folder, a_run, flat
+from inputs import HOUR, a_folder, a_run, flat
 
 KEPT = sorted((pathlib.Path(__file__).parents[2] / "results").glob("*.json.gz"))
 DEFAULTS = {"vrm": {"gamma": 0.99, "layers": [256, 256], "tau": 0.005}}

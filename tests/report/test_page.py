@@ -15,7 +15,7 @@ import tempfile
 import pytest
 
 from beliefrl.report import write_report
-from written import EVIL, HOUR, TWO_SEEDS, a_folder
+from inputs import EVIL, HOUR, TWO_SEEDS, a_folder
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 

@@ -13,7 +13,7 @@ from beliefrl import Options, UserError, resume
 from beliefrl.runs import arrays, best, trackers
 from beliefrl.runs.folder import locked, make
 from beliefrl.runs.run import Recorder
-from written import a_run, flat
+from inputs import a_run, flat
 
 CONFIG = {
     "agent": "vrm",

@@ -12,7 +12,7 @@ from beliefrl.sweeps import run as runs
 from beliefrl.sweeps.plan import Experiment, grid
 from beliefrl.training.stop import Stopped
 from beliefrl.types import UserError
-from written import Places
+from inputs import Places
 
 TWO = grid(["vrm"], ["pendulum", "cartpole"], seeds=2, steps=10)
 

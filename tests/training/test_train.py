@@ -202,7 +202,7 @@ def test_ctrl_c_ends_with_one_sentence(tmp_path):
 
 # Agents learn tasks, from the command to the last evaluation, with their default settings: minutes each.
 #
-# VRM takes five minutes to its first solved task; what it reaches is in docs/results, and `test_probes` has it learn
+# VRM takes five minutes to its first solved task; what it reaches is in docs/results, and `test_ablations` has it learn
 # small worlds that need memory.
 
 LEARNED = {  # agent, task, steps, a return that says the task was learned
