@@ -1,9 +1,7 @@
-"""Measure the cost of a checkpoint every 2,000 steps, at the sizes of velocities-only Hopper.
+"""What a training keeps, in memory and on the disk.
 
-    python benchmarks/checkpoint.py            # about ten minutes
-
-Stretches of 2,000 steps with and without a checkpoint alternate. The difference of their times includes the time that
-the training waits for a checkpoint, and the slowdown while a thread writes it.
+python benchmarks/storage.py replay        # the memory of a full replay
+python benchmarks/storage.py checkpoint    # the cost of checkpoints
 """
 
 import pathlib
@@ -15,14 +13,40 @@ import jax
 import numpy as np
 import tyro
 
-from beliefrl import agents
+from beliefrl import Options, agents
 from beliefrl.runs.checkpoint import Checkpoints
-from beliefrl.training import phases
+from beliefrl.training import phases, schedule
 from beliefrl.training.bench import Noise
 
+STEPS, EPISODE = 800_000, 1000  # with room for 1.25 timesteps a step, this is the largest replay by default
 
-def main(name: str = "vrm", steps: int = 2_000, capacity: int = 200_000, rounds: int = 3) -> None:
-    """Time `steps` steps of the agent, `rounds` times with a checkpoint at their start and `rounds` times without."""
+
+def replay() -> None:
+    """The memory of a replay of a million timesteps, divided by that of the data in it.
+
+    Episodes have 1,000 steps.
+    """
+    for name in ("vrm", "sac-mlp", "sac-lstm", "slac"):
+        agent, task = agents.make(name), Noise(6, 3)
+        capacity = schedule.capacity(agent, Options(steps=STEPS))
+        seed = phases.begin(agent, task, capacity, jax.random.key(0))
+        ring = sum(leaf.nbytes for leaf in jax.tree.leaves(seed.replay.timesteps))
+        data = ring / capacity * (STEPS + STEPS // EPISODE)
+        print(f"{name}: {ring / 1e9:.2f} GB for {data / 1e9:.2f} GB of data, ratio {ring / data:.2f}")
+
+
+def checkpoint(name: str = "vrm", steps: int = 2_000, capacity: int = 200_000, rounds: int = 3) -> None:
+    """Measure the cost of a checkpoint every 2,000 steps, at the sizes of velocities-only Hopper: about ten minutes.
+
+    Stretches of `steps` steps with and without a checkpoint alternate. The difference of their times includes the time
+    that the training waits for a checkpoint, and the slowdown while a thread writes it.
+
+    Args:
+        name: the agent.
+        steps: steps of a stretch.
+        capacity: timesteps of the replay.
+        rounds: stretches of each kind that are timed.
+    """
     agent, every = agents.make(name), 100
     program = phases.compile_program(agent, Noise(6, 3), capacity, 1)
     seeds = program.begin(jax.random.split(jax.random.key(0), 1))
@@ -53,4 +77,4 @@ def main(name: str = "vrm", steps: int = 2_000, capacity: int = 200_000, rounds:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    tyro.extras.subcommand_cli_from_dict({"replay": replay, "checkpoint": checkpoint})
