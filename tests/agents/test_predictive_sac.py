@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from agents.random_windows import SPEC, changed_where_missing, same, windows
 from beliefrl.agents.predictive_sac import PredictiveSACAgent, draw
 from beliefrl.models.nets import standardise
 from beliefrl.models.predictive_model import init_model, prediction_loss
 from beliefrl.types import UserError
+from inputs import SPEC, changed_where_missing, same, windows
 
 AGENT = PredictiveSACAgent(
     policy_layers=(8,),

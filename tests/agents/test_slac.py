@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from agents.random_windows import SPEC, along, changed_where_missing, differ, random_like, same, slope, windows
 from beliefrl.agents.slac import SLACAgent, begin_windows
 from beliefrl.models.latent_model import elbo_terms
 from beliefrl.types import UserError, perception
+from inputs import SPEC, along, changed_where_missing, differ, random_like, same, slope, windows
 
 AGENT = SLACAgent(
     policy_layers=(8,),

@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from agents.random_windows import SMALL, SPEC, differ, same
 from beliefrl import agents
 from beliefrl.agents.vrm import VRMAgent
 from beliefrl.models.nets import initial_statistics, standardise
 from beliefrl.models.variational_model import VRM
 from beliefrl.types import Timestep, UserError, Window, check_choice, perception
+from inputs import SMALL, SPEC, differ, same
 
 AGENT = VRMAgent(**SMALL)
 

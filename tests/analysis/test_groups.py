@@ -9,7 +9,7 @@ import pytest
 from beliefrl.analysis.aggregate import BOUNDS, draw_aggregate, interquartile_mean, interval, profile, scores
 from beliefrl.analysis.groups import find, groups, is_finished, last_step
 from beliefrl.types import UserError
-from written import a_run, flat
+from inputs import a_run, flat
 
 
 def labels(made):

@@ -1,4 +1,4 @@
-"""Our networks and losses give the numbers of the authors' code (tests/models/golden, toy sizes, PyTorch's layout)."""
+"""Our networks and losses give the numbers of the authors' code (golden.npz, toy sizes, PyTorch's layout)."""
 
 import pathlib
 from functools import partial
@@ -9,11 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from beliefrl.agents.sac_mlp import SACMLPAgent
 from beliefrl.models.nets import MLP, gaussian_log_prob
 from beliefrl.models.soft_actor_critic import Actor, Batch, Controller, loss, soft_update
 from beliefrl.models.variational_model import VRM, elbo_terms
+from beliefrl.types import Timestep, Window
 
-GOLDEN = pathlib.Path(__file__).parent / "golden"
+GOLDEN = dict(np.load(pathlib.Path(__file__).parent / "golden.npz"))
 D, Z, HIDDEN, X, ACTION = 16, 4, 8, 7, 3
 
 
@@ -25,7 +27,7 @@ def close(ours, theirs):
 
 
 def net(numbers, name, activation):
-    """The weights `name` of a golden file as an MLP."""
+    """The golden weights `name` as an MLP."""
     count = sum(key.startswith(f"{name}/") and key.endswith("weight") for key in numbers)
     sizes = [numbers[f"{name}/0/weight"].shape[1]] + [numbers[f"{name}/{i}/weight"].shape[0] for i in range(count)]
     mlp = jax.eval_shape(lambda: MLP(sizes, activation))
@@ -40,9 +42,9 @@ def net(numbers, name, activation):
     return eqx.tree_at(lambda mlp: mlp.layers, mlp, layers)
 
 
-def with_weights(part, group):
-    """All arrays of one group ("w/" or "g/") of a golden file, without the group's name."""
-    return {key.removeprefix(group): value for key, value in part.items() if key.startswith(group)}
+def group(numbers, prefix):
+    """All arrays whose names begin with a prefix, such as "sac/" or "w/", without the prefix."""
+    return {key.removeprefix(prefix): value for key, value in numbers.items() if key.startswith(prefix)}
 
 
 def vrm_from(numbers):
@@ -82,7 +84,7 @@ def vrm_from(numbers):
 
 @pytest.fixture(scope="module")
 def vrm_numbers():
-    return dict(np.load(GOLDEN / "vrm.npz"))
+    return group(GOLDEN, "vrm/")
 
 
 @pytest.fixture(scope="module")
@@ -102,12 +104,12 @@ def negative_elbo(vrm, inputs):
 @pytest.fixture(scope="module")
 def elbo(vrm_numbers, inputs):
     """The negative ELBO with the unroll and the terms that it comes from, and its gradient."""
-    vrm = vrm_from(with_weights(vrm_numbers, "w/"))
+    vrm = vrm_from(group(vrm_numbers, "w/"))
     return jax.jit(jax.value_and_grad(negative_elbo, has_aux=True))(vrm, inputs)
 
 
 def test_inference_equals_the_authors(vrm_numbers, inputs, elbo):
-    vrm, (inferred, _) = vrm_from(with_weights(vrm_numbers, "w/")), elbo[0][1]
+    vrm, (inferred, _) = vrm_from(group(vrm_numbers, "w/")), elbo[0][1]
     prior = jax.jit(jax.vmap(jax.vmap(vrm.prior)))(inferred.before, inputs[1])
     decoded = jax.jit(jax.vmap(jax.vmap(vrm.decode)))(inferred.before, inferred.z)
     ours = {
@@ -133,14 +135,14 @@ def test_elbo_equals_the_authors(vrm_numbers, elbo):
 
 
 def test_a_step_of_its_own_is_one_of_the_unroll(vrm_numbers, inputs, elbo):
-    vrm, (inferred, _) = vrm_from(with_weights(vrm_numbers, "w/")), elbo[0][1]
+    vrm, (inferred, _) = vrm_from(group(vrm_numbers, "w/")), elbo[0][1]
     before = jax.tree.map(lambda leaf: leaf[2, 0], inferred.state)
     after = jax.jit(lambda: vrm.next_state(before, inputs[0][3, 0], inferred.z[3, 0]))()
     jax.tree.map(lambda ours, theirs: close(ours, theirs[3, 0]), after, inferred.state)
 
 
 def test_with_noise_of_the_prior_its_draws_are_decoded(vrm_numbers, inputs, elbo):
-    vrm, (inferred, _) = vrm_from(with_weights(vrm_numbers, "w/")), elbo[0][1]
+    vrm, (inferred, _) = vrm_from(group(vrm_numbers, "w/")), elbo[0][1]
     x, action, _, noise = inputs
 
     @jax.jit
@@ -154,7 +156,7 @@ def test_with_noise_of_the_prior_its_draws_are_decoded(vrm_numbers, inputs, elbo
 
 
 def test_gradient_of_the_elbo_equals_the_authors(vrm_numbers, elbo):
-    numbers = with_weights(vrm_numbers, "g/")
+    numbers = group(vrm_numbers, "g/")
     np.testing.assert_array_equal(numbers["lstm/bias_ih"], numbers["lstm/bias_hh"])
     theirs = vrm_from(numbers | {"lstm/bias_hh": np.zeros_like(numbers["lstm/bias_hh"])})
     jax.tree.map(close, elbo[1], theirs)
@@ -162,7 +164,7 @@ def test_gradient_of_the_elbo_equals_the_authors(vrm_numbers, elbo):
 
 @pytest.fixture(scope="module")
 def sac_numbers():
-    return dict(np.load(GOLDEN / "sac.npz"))
+    return group(GOLDEN, "sac/")
 
 
 def controller_from(numbers, log_alpha):
@@ -175,7 +177,7 @@ def controller_from(numbers, log_alpha):
 
 @pytest.fixture(scope="module")
 def update(sac_numbers):
-    controller = controller_from(with_weights(sac_numbers, "w/"), sac_numbers["log_alpha"])
+    controller = controller_from(group(sac_numbers, "w/"), sac_numbers["log_alpha"])
     batch = Batch(
         *(jnp.array(sac_numbers[name]) for name in ("belief", "next_belief", "action", "reward")),
         terminated=jnp.array(sac_numbers["terminated"] > 0),
@@ -194,11 +196,30 @@ def test_losses_equal_the_authors(sac_numbers, update):
 
 def test_gradients_of_the_losses_equal_the_authors(sac_numbers, update):
     gradient = update[1][0]
-    theirs = controller_from(with_weights(sac_numbers, "g/"), sac_numbers["g/log_alpha"])
+    theirs = controller_from(group(sac_numbers, "g/"), sac_numbers["g/log_alpha"])
     jax.tree.map(close, gradient._replace(target_value=theirs.value), theirs)
 
 
 def test_target_value_moves_as_the_authors(sac_numbers, update):
     controller = update[0]
     after = jax.jit(partial(soft_update, tau=0.005))(controller.target_value, controller.value)
-    jax.tree.map(close, after, net(with_weights(sac_numbers, "after/"), "target_value", jax.nn.relu))
+    jax.tree.map(close, after, net(group(sac_numbers, "after/"), "target_value", jax.nn.relu))
+
+
+def test_its_transitions_are_those_of_the_golden_update(sac_numbers):
+    """As windows of two timesteps the numbers come out of SAC-MLP as the transitions that are learned from here."""
+    agent, numbers = SACMLPAgent(policy_layers=(8, 8), value_layers=(8, 8), batch_size=6), sac_numbers
+    timesteps = [numbers["belief"], numbers["next_belief"]]
+    rows, actions = len(numbers["reward"]), numbers["action"].shape[-1]
+    step = Timestep(
+        obs=jnp.stack(timesteps, axis=1),
+        reward=jnp.stack([jnp.zeros(rows), numbers["reward"]], axis=1),
+        prev_action=jnp.stack([jnp.zeros((rows, actions)), numbers["action"]], axis=1),
+        is_first=jnp.zeros((rows, 2), bool).at[:, 0].set(True),
+        terminated=jnp.stack([jnp.zeros(rows, bool), numbers["terminated"] > 0], axis=1),
+    )
+    window = jax.tree.map(lambda leaf: leaf.swapaxes(0, 1), Window(step, (), jnp.ones((rows, 2), bool)))
+    batch = jax.jit(agent.batch)(window)
+    for name in ("belief", "next_belief", "action", "reward", "terminated"):
+        np.testing.assert_array_equal(getattr(batch, name), numbers[name])
+    assert batch.valid.all()

@@ -3,7 +3,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from agents.random_windows import random_like
 from beliefrl.models import latent_model, nets, variational_model
 from beliefrl.models.nets import (
     MLP,
@@ -20,6 +19,7 @@ from beliefrl.models.nets import (
     update_statistics,
 )
 from beliefrl.models.recurrence import unroll
+from inputs import random_like
 
 
 def sigmoid(x):

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.random_windows import SMALL, SPEC, windows
 from beliefrl import agents
 from beliefrl.models.returns import n_step_returns, transition_batch
 from beliefrl.types import Timestep
+from inputs import SMALL, SPEC, windows
 
 GAMMA = 0.9
 

@@ -13,7 +13,7 @@ from beliefrl.analysis.panels import AGENTS, colours
 from beliefrl.report import write_report
 from beliefrl.report.data import statistics
 from beliefrl.types import UserError
-from written import EVIL, HOUR, TWO_SEEDS, a_folder
+from inputs import EVIL, HOUR, TWO_SEEDS, a_folder
 
 
 def page_data(folder, **options):

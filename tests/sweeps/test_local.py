@@ -20,7 +20,7 @@ from beliefrl.sweeps.progress import Forecast
 from beliefrl.sweeps.run import SweepStatus, reason
 from beliefrl.training.stop import Stopped
 from beliefrl.types import UserError
-from written import a_run
+from inputs import a_run
 
 QUICK = {
     "steps": 300,

@@ -14,7 +14,7 @@ from beliefrl.sweeps import local, ranges, study
 from beliefrl.sweeps import tune as tuning
 from beliefrl.training.stop import Stopped
 from beliefrl.types import UserError
-from written import Places, a_folder
+from inputs import Places, a_folder
 
 EVERY = 1000
 BEST = 3e-4  # the learning rate with the highest return; it is the agent's default

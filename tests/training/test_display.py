@@ -17,7 +17,7 @@ from beliefrl.training.display import TrainingDisplay, results_table
 from beliefrl.training.rollout import Episode
 from beliefrl.training.schedule import Event, Phase
 from beliefrl.training.screen import Notebook, Screen, Terminal
-from written import a_run
+from inputs import a_run
 from wrong import Fine
 
 AGENT = agents.make("sac-mlp", step_start_rl=20, pretrain_updates=10, policy_layers=(8,), value_layers=(8,))

@@ -1,7 +1,7 @@
 """Small trained agents that come with the package, for `beliefrl demo`.
 
-Each is a zip file with the folder of a run: its settings, log, evaluation and agent. `benchmarks/results/demo.py` makes
-these files.
+Each is a zip file with the folder of a run: its settings, log, evaluation and agent. `benchmarks/results/keep.py`
+makes these files.
 """
 
 import os

@@ -1,4 +1,4 @@
-"""SAC-LSTM: its LSTM against numpy, where gradients go, beliefs in time."""
+"""SAC-MLP: what enters no loss, units of observations. SAC-LSTM: its LSTM against numpy, gradients, beliefs in time."""
 
 import dataclasses
 
@@ -7,19 +7,77 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from agents.random_windows import SPEC, along, changed_where_missing, differ, random_like, slope, windows
 from beliefrl.agents.sac_lstm import SACLSTMAgent
+from beliefrl.agents.sac_mlp import SACMLPAgent
 from beliefrl.models.nets import LSTM, draw
 from beliefrl.models.soft_actor_critic import actor_loss, q_loss, state_value, value_loss
 from beliefrl.types import UserError
+from inputs import SPEC, along, changed_where_missing, differ, random_like, slope, windows
 
-AGENT = SACLSTMAgent(policy_layers=(8,), value_layers=(8,), d_size=8, seq_len=6, batch_size=2, burn_in=4)
+MLP = SACMLPAgent(policy_layers=(8, 8), value_layers=(8, 8), batch_size=6)
+STANDARDISED = dataclasses.replace(MLP, standardise=True)
+
+
+def begun(agent):
+    return jax.jit(lambda key: agent.init(key, SPEC))(jax.random.key(0))
+
+
+def test_pairs_across_episodes_enter_no_loss():
+    is_first = jnp.zeros((6, 2), bool).at[:, 0].set(True).at[2, 1].set(True)
+    state, update = begun(MLP), jax.jit(MLP.pretrain)
+    one = windows(jax.random.key(1), 6, 2, is_first)
+    other = jax.tree.map(lambda leaf: leaf.at[:, 2].set(leaf[:, 3]) if leaf.dtype != bool else leaf, one)
+    results = [update(state, window, jax.random.key(2)) for window in (one, other)]
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7), *results)
+    assert not np.allclose(one.step.obs[:, 2], other.step.obs[:, 2])
+
+
+@pytest.mark.parametrize("agent", [MLP, pytest.param(STANDARDISED, marks=pytest.mark.nightly)])
+def test_pretraining_is_an_update_of_the_controller(agent):
+    window, state = windows(jax.random.key(1), 6, 2), begun(agent)
+    after, _ = jax.jit(agent.pretrain)(state, window, jax.random.key(2))
+    cycle, batches, metrics = jax.jit(agent.begin_cycle)(state, window, jax.random.key(7))
+    again, _ = jax.jit(agent.update)(cycle, jax.tree.map(lambda leaf: leaf[0], batches), jax.random.key(2))
+    assert metrics == {}
+    assert differ(after.controller, state.controller)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7), after, again)
+
+
+def test_standardised_it_does_not_matter_in_which_units_observations_are():
+    window, state = windows(jax.random.key(1), 6, 2), begun(STANDARDISED)
+    units = np.array([[[100.0, 20.0, 0.5]]], np.float32)
+    others = window._replace(step=window.step._replace(obs=(window.step.obs + 7) * units))
+    actions, learn, act = [], jax.jit(STANDARDISED.pretrain), jax.jit(STANDARDISED.act)
+    for each in (window, others):
+        after, _ = learn(state, each, jax.random.key(2))
+        step = jax.tree.map(lambda leaf: leaf[1, 3], each.step)
+        actions.append(act(after, (), step, jax.random.key(3), jnp.array(False))[0])
+    np.testing.assert_allclose(*actions, rtol=0.01)  # but for what keeps quiet entries from infinity
+    raw = jax.jit(MLP.act)(after._replace(scale=None), (), step, jax.random.key(3), jnp.array(False))[0]
+    assert np.abs(raw - actions[0]).max() > 0.05
+
+
+WRONG = [
+    *({"batch_size": 0}, {"batch_size": True}, {"pretrain_updates": -1}, {"gamma": 2.0}),
+    *({"policy_layers": ()}, {"policy_layers": 64}, {"policy_layers": [64, 64]}),
+]
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_impossible_hyperparameters_of_sac_mlp_are_refused(wrong, unchecked):
+    with pytest.raises(UserError, match=f"{next(iter(wrong))}="):
+        SACMLPAgent(**wrong)
+
+
+# SAC-LSTM.
+
+RECURRENT = SACLSTMAgent(policy_layers=(8,), value_layers=(8,), d_size=8, seq_len=6, batch_size=2, burn_in=4)
 TIME = 11
 
 
 @pytest.fixture(scope="module")
 def state():
-    return jax.jit(lambda key: AGENT.init(key, SPEC))(jax.random.key(0))
+    return jax.jit(lambda key: RECURRENT.init(key, SPEC))(jax.random.key(0))
 
 
 def sigmoid(x):
@@ -45,8 +103,8 @@ def test_the_lstm_is_the_textbooks():
 def test_acting_forms_the_belief_that_replay_forms(state):
     window = windows(jax.random.key(1), 1, TIME, jnp.zeros((1, TIME), bool).at[0, jnp.array([0, 5])].set(True))
     step = window.step
-    at_once = jax.jit(lambda: state.lstm.unroll(state.lstm.start(1), AGENT.perception(step), step.is_first))()
-    memory, act = AGENT.reset(SPEC), jax.jit(AGENT.act)
+    at_once = jax.jit(lambda: state.lstm.unroll(state.lstm.start(1), RECURRENT.perception(step), step.is_first))()
+    memory, act = RECURRENT.reset(SPEC), jax.jit(RECURRENT.act)
     for t in range(TIME):
         timestep = jax.tree.map(lambda leaf, t=t: leaf[t, 0], window.step)
         _, memory = act(state, memory, timestep, jax.random.key(t), jnp.array(False))
@@ -60,11 +118,11 @@ def batch_of(agent, lstm, window):
 
 def test_batches_are_aligned_in_time(state):
     window = windows(jax.random.key(1), 2, TIME)
-    batch = jax.jit(lambda: batch_of(AGENT, state.lstm, window))()
+    batch = jax.jit(lambda: batch_of(RECURRENT, state.lstm, window))()
     step = window.step
-    d = jax.jit(lambda: state.lstm.unroll(state.lstm.start(2), AGENT.perception(step), step.is_first).d)()
+    d = jax.jit(lambda: state.lstm.unroll(state.lstm.start(2), RECURRENT.perception(step), step.is_first).d)()
     for t, sequence in ((0, 0), (2, 1), (5, 1)):
-        row, now = 2 * t + sequence, AGENT.burn_in + t
+        row, now = 2 * t + sequence, RECURRENT.burn_in + t
         np.testing.assert_allclose(batch.belief[row], d[now, sequence], rtol=1e-5, atol=1e-6)
         np.testing.assert_allclose(batch.next_belief[row], d[now + 1, sequence], rtol=1e-5, atol=1e-6)
         np.testing.assert_array_equal(batch.actor_input[row], batch.belief[row])
@@ -98,7 +156,7 @@ def frozen_losses(agent, state, window, key):
 @pytest.mark.slow
 def test_gradients_of_three_losses_reach_the_lstm_and_none_through_targets(state):
     """By finite differences of each loss alone; those of J_V and J_Q come together, that of J_π by itself."""
-    agent = dataclasses.replace(AGENT, burn_in=0, seq_len=TIME - 1)
+    agent = dataclasses.replace(RECURRENT, burn_in=0, seq_len=TIME - 1)
     window, key = windows(jax.random.key(1), 2, TIME), jax.random.key(2)
     direction = random_like(state.lstm, jax.random.key(3))
     functions = [jax.jit(function) for function in frozen_losses(agent, state, window, key)]
@@ -113,11 +171,11 @@ def test_gradients_of_three_losses_reach_the_lstm_and_none_through_targets(state
 def test_the_target_lstm_is_what_the_target_value_reads(state):
     window, key = windows(jax.random.key(1), 2, TIME), jax.random.key(2)
     other = jax.tree.map(lambda leaf: leaf + 0.1, state.lstm)
-    d = AGENT.beliefs(state.lstm, window)
-    batch = AGENT.batch(window, d, d, AGENT.beliefs(other, window))
-    np.testing.assert_array_equal(batch.belief, batch_of(AGENT, state.lstm, window).belief)
-    np.testing.assert_array_equal(batch.next_belief, batch_of(AGENT, other, window).next_belief)
-    gradients = jax.jit(AGENT.gradients)
+    d = RECURRENT.beliefs(state.lstm, window)
+    batch = RECURRENT.batch(window, d, d, RECURRENT.beliefs(other, window))
+    np.testing.assert_array_equal(batch.belief, batch_of(RECURRENT, state.lstm, window).belief)
+    np.testing.assert_array_equal(batch.next_belief, batch_of(RECURRENT, other, window).next_belief)
+    gradients = jax.jit(RECURRENT.gradients)
     (grad_critics, grad_actor, _), _ = gradients(state.lstm, state.lstm, state.controller, window, key)
     (grad_critics_now, grad_actor_now, _), _ = gradients(state.lstm, other, state.controller, window, key)
     assert differ(grad_critics, grad_critics_now)
@@ -127,9 +185,9 @@ def test_the_target_lstm_is_what_the_target_value_reads(state):
 def test_no_gradient_goes_into_the_burn_in(state):
     """The weights by which the burn-in alone perceives the first input do not learn."""
     window, key = windows(jax.random.key(1), 2, TIME), jax.random.key(2)
-    obs = window.step.obs.at[AGENT.burn_in :, :, 0].set(0.0)
+    obs = window.step.obs.at[RECURRENT.burn_in :, :, 0].set(0.0)
     window = window._replace(step=window.step._replace(obs=obs))
-    grad_critics, grad_actor, _ = jax.jit(AGENT.gradients)(state.lstm, state.lstm, state.controller, window, key)[0]
+    grad_critics, grad_actor, _ = jax.jit(RECURRENT.gradients)(state.lstm, state.lstm, state.controller, window, key)[0]
     for gradient in (grad_critics, grad_actor):
         np.testing.assert_array_equal(gradient.w_x[0], 0.0)
         assert np.all(gradient.w_x[1] != 0.0)
@@ -137,27 +195,27 @@ def test_no_gradient_goes_into_the_burn_in(state):
 
 def test_an_update_trains_everything_and_the_targets_follow_slowly(state):
     window = windows(jax.random.key(1), 2, TIME)
-    after, _ = jax.jit(AGENT.pretrain)(state, window, jax.random.key(2))
+    after, _ = jax.jit(RECURRENT.pretrain)(state, window, jax.random.key(2))
     assert differ(after.lstm, state.lstm)
-    expected = jax.tree.map(lambda old, new: old + AGENT.tau * (new - old), state.target_lstm, after.lstm)
+    expected = jax.tree.map(lambda old, new: old + RECURRENT.tau * (new - old), state.target_lstm, after.lstm)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-7), after.target_lstm, expected)
     assert differ(after.controller._replace(target_value=0), state.controller._replace(target_value=1))
 
 
 def test_timesteps_that_do_not_exist_enter_no_loss(state):
     exists = jnp.ones((2, TIME), bool).at[:, 8:].set(False)
-    results = changed_where_missing(AGENT, state, windows(jax.random.key(1), 2, TIME), exists)
+    results = changed_where_missing(RECURRENT, state, windows(jax.random.key(1), 2, TIME), exists)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), *results)
 
 
 def test_it_perceives_what_its_options_name():
     for more, size in (({}, 3), ({"perceive_action": True}, 5), ({"perceive_reward": True}, 4)):
-        agent = dataclasses.replace(AGENT, **more)
+        agent = dataclasses.replace(RECURRENT, **more)
         state = jax.eval_shape(lambda key, agent=agent: agent.init(key, SPEC), jax.random.key(0))
         assert state.lstm.w_x.shape[0] == size
 
 
 @pytest.mark.parametrize("wrong", [{"seq_len": 0}, {"burn_in": -1}, {"lr_lstm": 2.0}, {"pretrain_updates": -1}])
-def test_impossible_hyperparameters_are_refused(wrong):
+def test_impossible_hyperparameters_of_sac_lstm_are_refused(wrong):
     with pytest.raises(UserError, match=f"{next(iter(wrong))}="):
         SACLSTMAgent(**wrong)
