@@ -141,7 +141,7 @@ def flat(*returns):
 
 
 class Places:
-    """The part of `sweeps.local.Local` that counts free slots, for fake trainings."""
+    """The part of `sweeps.places.Local` that counts free slots, for fake trainings."""
 
     def __init__(self, folder, slots):
         self.folder, self.slots, self.running = folder, slots, {}

@@ -11,7 +11,7 @@ print(beliefrl.evaluate(run, episodes=20))
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from beliefrl.registration import register_when_imported
+from beliefrl.catalogue import register_when_imported
 
 if TYPE_CHECKING:
     from beliefrl.agents import Agent

@@ -13,7 +13,7 @@ import pytest
 
 from beliefrl import cli, sweep
 from beliefrl.runs.run import Run
-from beliefrl.sweeps import local
+from beliefrl.sweeps import places
 from beliefrl.sweeps import progress as module
 from beliefrl.sweeps.plan import Experiment, Training, grid, plan
 from beliefrl.sweeps.progress import Forecast
@@ -39,7 +39,7 @@ def rows(folder):
 
 def test_a_training_that_fails_frees_its_core_and_says_why(tmp_path):
     (tmp_path / "logs").mkdir()
-    launcher = local.Local(tmp_path, ["0"])
+    launcher = places.Local(tmp_path, ["0"])
     launcher.start(Training("wrong", "vmr", "pendulum", {}, {"steps": 1, "seed": 0, "seeds": 1}))
     assert launcher.room == 0
     while not (codes := launcher.ended()):
@@ -52,11 +52,11 @@ def test_a_training_that_fails_frees_its_core_and_says_why(tmp_path):
 def test_the_reason_of_a_failure_is_not_that_of_an_earlier_session(tmp_path):
     path = tmp_path / "log"
     for said in ("beliefrl: stopped at step 10\n", ""):
-        with local.open_log(path) as log:
+        with places.open_log(path) as log:
             log.write(said.encode())
     assert "stopped at step 10" in path.read_text()
     assert reason(path, -9) == "it ended with code -9 and printed nothing"
-    with local.open_log(path) as log:
+    with places.open_log(path) as log:
         log.write(b"Traceback\nValueError: odd\n")
     assert reason(path, 1) == "ValueError: odd"
 
@@ -72,30 +72,30 @@ def test_a_worker_runs_on_its_core():
 def test_there_is_a_slot_for_each_core_and_no_more_than_asked_for(monkeypatch):
     monkeypatch.setattr(local, "_gpus", lambda: 0)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3, 1, 2}, raising=False)
-    assert local.slots() == ["1", "2", "3"]
-    assert local.slots(2) == ["1", "2"]
-    assert local.slots(4) == ["1", "2", "3", "any"]
+    assert places.slots() == ["1", "2", "3"]
+    assert places.slots(2) == ["1", "2"]
+    assert places.slots(4) == ["1", "2", "3", "any"]
     monkeypatch.setattr(local, "_gpus", lambda: 2)
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
-    assert local.slots() == local.slots(3) == ["gpu0", "gpu1"]
-    assert local.slots(1) == ["gpu0"]
+    assert places.slots() == places.slots(3) == ["gpu0", "gpu1"]
+    assert places.slots(1) == ["gpu0"]
 
 
 def test_trainings_run_only_on_the_gpus_that_the_sweep_may_use(tmp_path, monkeypatch):
     monkeypatch.setattr(local, "_gpus", lambda: 2)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2, GPU-8f1c")
-    used = [local.environment(tmp_path, slot)["CUDA_VISIBLE_DEVICES"] for slot in local.slots()]
+    used = [places.environment(tmp_path, slot)["CUDA_VISIBLE_DEVICES"] for slot in places.slots()]
     assert used == ["2", "GPU-8f1c"]
-    assert local.slots(1) == ["gpu2"]
+    assert places.slots(1) == ["gpu2"]
 
 
 def test_a_training_has_one_thread_on_a_core_and_one_gpu_on_a_gpu(tmp_path, monkeypatch):
     for name in ("NPROC", "JAX_COMPILATION_CACHE_DIR"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5")
-    assert local.environment(tmp_path, "0")["NPROC"] == "1"
-    assert "NPROC" not in local.environment(tmp_path, "-")
-    on_gpu = local.environment(tmp_path, "gpu3")
+    assert places.environment(tmp_path, "0")["NPROC"] == "1"
+    assert "NPROC" not in places.environment(tmp_path, "-")
+    on_gpu = places.environment(tmp_path, "gpu3")
     assert on_gpu["CUDA_VISIBLE_DEVICES"] == "3"
     assert pathlib.Path(on_gpu["JAX_COMPILATION_CACHE_DIR"]).is_relative_to(tmp_path)
 
@@ -235,7 +235,7 @@ def test_what_a_training_does_is_read_off_its_last_lines(tmp_path):
 
 
 def test_one_training_can_be_stopped_alone(tmp_path):
-    launcher = local.Local(tmp_path, [])
+    launcher = places.Local(tmp_path, [])
     programs = {name: subprocess.Popen(["sleep", "60"]) for name in ("one", "other")}
     for name, program in programs.items():
         launcher._running[name] = program, "any"
@@ -247,7 +247,7 @@ def test_one_training_can_be_stopped_alone(tmp_path):
 
 
 def test_trainings_that_finish_while_all_are_stopped_have_their_exit_codes(tmp_path):
-    launcher = local.Local(tmp_path, [])
+    launcher = places.Local(tmp_path, [])
     code = "import signal, sys; signal.signal(15, lambda *_: sys.exit(0)); print(flush=True); signal.pause()"
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as program:
         assert program.stdout.readline()  # from now on it finishes at SIGTERM

@@ -10,7 +10,7 @@ import sys
 import pytest
 
 from beliefrl import Range, agents, cli, tune
-from beliefrl.sweeps import local, ranges, study
+from beliefrl.sweeps import places, ranges, study
 from beliefrl.sweeps import tune as tuning
 from beliefrl.training.stop import Stopped
 from beliefrl.types import UserError
@@ -64,7 +64,7 @@ def test_ranges_are_read_from_text():
     assert ranges.from_text("d_size", "8,64") is None
 
 
-class Fake(Places, local.Local):
+class Fake(Places, places.Local):
     """Trainings that make one evaluation at each look: the nearer lr_actor is to BEST, the higher the return."""
 
     started: list = []

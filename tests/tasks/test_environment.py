@@ -12,7 +12,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from beliefrl import tasks
-from beliefrl.registration import ids, register
+from beliefrl.catalogue import register, registered_ids
 from beliefrl.tasks.environment import TaskEnvironment
 from beliefrl.types import UserError
 from worlds import Counting
@@ -37,7 +37,7 @@ def actions_for(env, steps, seed=0):
 
 
 def test_every_task_and_every_mask_has_an_id():
-    assert ids() == {
+    assert registered_ids() == {
         "BeliefRL/Pendulum-v0": "pendulum",
         "BeliefRL/PendulumV-v0": "pendulum-v",
         "BeliefRL/PendulumP-v0": "pendulum-p",
@@ -56,7 +56,7 @@ def test_registering_twice_changes_nothing():
 
 # Gymnasium warns of every observation without bounds, its own CartPole's and MuJoCo's too.
 @pytest.mark.filterwarnings("ignore:.*A Box observation space (min|max)imum value is -?infinity")
-@pytest.mark.parametrize("identifier", ids())
+@pytest.mark.parametrize("identifier", registered_ids())
 def test_gymnasiums_checker_passes(identifier):
     check_env(gymnasium.make(identifier).unwrapped)
 
@@ -208,7 +208,7 @@ def test_stable_baselines_checks_and_trains_on_it():
     checker = pytest.importorskip("stable_baselines3.common.env_checker")
     contrib = pytest.importorskip("sb3_contrib")
     pytest.importorskip("torch").set_num_threads(1)  # more of them wait for each other where cores are busy
-    for identifier in ids():
+    for identifier in registered_ids():
         checker.check_env(gymnasium.make(identifier))
     agent = contrib.RecurrentPPO("MlpLstmPolicy", "BeliefRL/PendulumV-v0", n_steps=16, batch_size=16)
     assert agent.learn(32).num_timesteps == 32

@@ -1,1 +1,1 @@
-"""Sweeps of many trainings: the list (`plan`, `sources`), where they run (`local`, `cluster`), the loop (`run`)."""
+"""Sweeps of many trainings: the list (`plan`, `sources`), where they run (`places`), the loop (`run`)."""

@@ -9,7 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from beliefrl import agents
 from beliefrl.runs.folder import locked
-from beliefrl.sweeps import cluster, local, sources
+from beliefrl.sweeps import places, sources
 from beliefrl.sweeps import plan as plans
 from beliefrl.sweeps.plan import Experiment, Training
 from beliefrl.sweeps.progress import SweepStatus
@@ -65,10 +65,10 @@ def sweep(
     with lock(folder):
         before = sources.read(folder)
         _check_named(folder, before, experiments)
-        slots = [] if ray else ["-"] if workers == 0 else local.slots(workers)
-        launcher = cluster.Cluster(folder, ray, workers) if ray else local.Local(folder, slots)
+        slots = [] if ray else ["-"] if workers == 0 else places.slots(workers)
+        launcher = places.Cluster(folder, ray, workers) if ray else places.Local(folder, slots)
         try:
-            on_gpu = launcher.has_gpus if isinstance(launcher, cluster.Cluster) else slots[0].startswith("gpu")
+            on_gpu = launcher.has_gpus if isinstance(launcher, places.Cluster) else slots[0].startswith("gpu")
             together = seeds_per_run or (ALL if on_gpu else None)
             status = _status(folder, plans.extended(before, experiments, together))
             with reporting(folder, report, progress) as listen, Requests() as requests:
@@ -138,7 +138,7 @@ def _loop(folder: pathlib.Path, status: SweepStatus, launcher: Launcher, report:
 
 def reason(log: pathlib.Path, code: int) -> str:
     """Why a training failed: its last error message, or else the last line of its output, in this session."""
-    _, _, output = log.read_text(errors="replace").rpartition(local.BEGIN)
+    _, _, output = log.read_text(errors="replace").rpartition(places.BEGIN)
     lines = [line.strip() for line in output.splitlines() if line.strip()]
     messages = [line.removeprefix("beliefrl: ") for line in lines if line.startswith("beliefrl: ")] or lines
     return messages[-1] if messages else f"it ended with code {code} and printed nothing"

@@ -21,7 +21,7 @@ from typing import Any, get_args
 from beliefrl.agents.hyperparameters import Ranges
 from beliefrl.runs.options import Options
 from beliefrl.runs.run import Run
-from beliefrl.sweeps import local, ranges, study
+from beliefrl.sweeps import places, ranges, study
 from beliefrl.sweeps.plan import Experiment, Training
 from beliefrl.sweeps.progress import SweepStatus
 from beliefrl.sweeps.run import lock, reason, reporting
@@ -120,7 +120,7 @@ def _run(folder: pathlib.Path, search: Search, trials: int, prune: bool, workers
         recorded = study.open_study(folder, search, prune)
         stopped = study.running(recorded)
         status = _status(recorded, search.base, trials)
-        launcher = local.Local(folder, local.slots(workers))
+        launcher = places.Local(folder, places.slots(workers))
         with reporting(folder, None, progress) as listen, Requests() as requests:
             try:
                 loop = _Loop(folder, recorded, search, launcher, status, stopped)
@@ -194,7 +194,7 @@ class _Loop:
         folder: pathlib.Path,
         recorded: Any,
         search: Search,
-        launcher: local.Local,
+        launcher: places.Local,
         status: SweepStatus,
         stopped: list[tuple[Any, dict[str, Any]]],
     ):

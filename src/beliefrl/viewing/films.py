@@ -27,9 +27,7 @@ from beliefrl.tasks.drawing import INK, PAPER, Viewer
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.evaluation import restore_seed
 from beliefrl.types import LARGEST, UserError, cause, check_whole
-from beliefrl.viewing import rendering
-from beliefrl.viewing.episodes import Frame, Player, Trajectory, check_episode
-from beliefrl.viewing.rendering import Pixels
+from beliefrl.viewing.episodes import Frame, Pixels, Player, Trajectory, check_episode, pace_of
 
 FASTEST = 50.0  # frames per second that GIFs and screens can show
 Writer = Callable[[Pixels], None]
@@ -79,7 +77,7 @@ def video(
             raise UserError(f"{name}={rate} is impossible: it must be a number above 0 and up to 1000.")
     show = _window if path is None else functools.partial(_encoder, pathlib.Path(path), kind_of(pathlib.Path(path)))
     with Player(*restore_seed(run, seed, task, agent, best), rendered=True) as player:
-        pace = rendering.pace(player.environment)
+        pace = pace_of(player.environment)
         every = 1 if fps else math.ceil(pace / fastest)
         with show(fps or pace / every) as add:
             return [
