@@ -142,7 +142,7 @@ class Window(NamedTuple):
 
     step: Timestep  # leaves (time, batch, ...)
     note: Any
-    exists: Bool[Array, "time *batch"]  # False outside of the stored timesteps
+    exists: Bool[Array, " time *batch"]  # False outside of the stored timesteps
 
     def between(self, start: int, stop: int | None) -> "Window":
         """The timesteps from `start` to `stop`, as in a slice."""
@@ -156,7 +156,7 @@ class WindowShape(NamedTuple):
     length: int
 
 
-def transitions(window: Window, burn_in: int) -> Bool[Array, "length *batch"]:
+def transitions(window: Window, burn_in: int) -> Bool[Array, " length *batch"]:
     """Whether each pair of neighbouring timesteps after the burn-in is a transition."""
     now, after = window.exists[burn_in:-1], window.exists[burn_in + 1 :]
     return now & after & ~window.step.is_first[burn_in + 1 :]

@@ -70,19 +70,19 @@ def test_a_worker_runs_on_its_core():
 
 
 def test_there_is_a_slot_for_each_core_and_no_more_than_asked_for(monkeypatch):
-    monkeypatch.setattr(local, "_gpus", lambda: 0)
+    monkeypatch.setattr(places, "_gpus", lambda: 0)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3, 1, 2}, raising=False)
     assert places.slots() == ["1", "2", "3"]
     assert places.slots(2) == ["1", "2"]
     assert places.slots(4) == ["1", "2", "3", "any"]
-    monkeypatch.setattr(local, "_gpus", lambda: 2)
+    monkeypatch.setattr(places, "_gpus", lambda: 2)
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     assert places.slots() == places.slots(3) == ["gpu0", "gpu1"]
     assert places.slots(1) == ["gpu0"]
 
 
 def test_trainings_run_only_on_the_gpus_that_the_sweep_may_use(tmp_path, monkeypatch):
-    monkeypatch.setattr(local, "_gpus", lambda: 2)
+    monkeypatch.setattr(places, "_gpus", lambda: 2)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2, GPU-8f1c")
     used = [places.environment(tmp_path, slot)["CUDA_VISIBLE_DEVICES"] for slot in places.slots()]
     assert used == ["2", "GPU-8f1c"]

@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from beliefrl.agents.base import ControllerAgent, Metrics, Range
 from beliefrl.models import double_q
-from beliefrl.models.double_q import Controller
+from beliefrl.models.double_q import DoubleQController
 from beliefrl.models.nets import (
     LSTMState,
     RunningStatistics,
@@ -57,7 +57,7 @@ class State(NamedTuple):
     """Everything that training changes."""
 
     model: PredictiveModel
-    controller: Controller
+    controller: DoubleQController
     scales: Scales
     pool: Pool
     model_optimiser: optax.OptState

@@ -40,7 +40,7 @@ UNIT_RATE = 1e-3  # smallest weight of a new batch in u², reached after 1 / rat
 UNIT_MIN = 1e-4
 
 
-class Actor(eqx.Module):
+class OneTrunkActor(eqx.Module):
     """π(a|s): a Gaussian squashed by tanh; one network for its mean and log σ."""
 
     network: MLP
@@ -65,17 +65,17 @@ class Unit(NamedTuple):
         return jnp.sqrt(self.square) + UNIT_MIN
 
 
-class Controller(NamedTuple):
+class DoubleQController(NamedTuple):
     """Everything that J_Q, J_π and J_α train."""
 
-    actor: Actor
+    actor: OneTrunkActor
     critics: tuple[MLP, MLP]  # Q_1 / u, Q_2 / u
     targets: tuple[MLP, MLP]  # Q̄_1 / u, Q̄_2 / u
     log_alpha: Float[Array, ""]
     unit: Unit
 
 
-def init_optimisers(optimisers: Optimisers, controller: Controller) -> OptimiserState:
+def init_optimisers(optimisers: Optimisers, controller: DoubleQController) -> OptimiserState:
     """Fresh states for `update`."""
     return OptimiserState(
         optimisers.actor.init(controller.actor),  # pyright: ignore[reportArgumentType]
@@ -91,16 +91,16 @@ def init_controller(
     policy_layers: tuple[int, ...],
     value_layers: tuple[int, ...],
     alpha: float,
-) -> Controller:
+) -> DoubleQController:
     """A new controller for beliefs and actions of these sizes; Q̄ starts as Q, α at `alpha`, u at 1."""
     critic = MLP((belief + action, *value_layers, 1), jax.nn.relu)
-    actor, critics = draw(key, (Actor(belief, action, policy_layers), (critic, critic)))
+    actor, critics = draw(key, (OneTrunkActor(belief, action, policy_layers), (critic, critic)))
     unit = Unit(jnp.ones(()), jnp.zeros(()))
-    return Controller(actor, critics, jax.tree.map(jnp.copy, critics), jnp.full((), math.log(alpha)), unit)
+    return DoubleQController(actor, critics, jax.tree.map(jnp.copy, critics), jnp.full((), math.log(alpha)), unit)
 
 
 def sample(
-    actor: Actor, belief: Float[Array, "batch belief"], key: Key[Array, ""]
+    actor: OneTrunkActor, belief: Float[Array, "batch belief"], key: Key[Array, ""]
 ) -> tuple[Float[Array, "batch action"], Float[Array, " batch"], Float[Array, "batch action"]]:
     """ã, log π(ã|s) and μ."""
     mean, log_sigma = jax.vmap(actor)(belief)
@@ -108,14 +108,16 @@ def sample(
     return action, log_prob, mean
 
 
-def target(controller: Controller, batch: Batch, key: Key[Array, ""]) -> Float[Array, " batch"]:
+def target(controller: DoubleQController, batch: Batch, key: Key[Array, ""]) -> Float[Array, " batch"]:
     """y."""
     action, _, _ = sample(controller.actor, batch.next_belief, key)
     after = controller.unit.u * least(controller.targets, batch.next_belief, action)
     return batch.reward + batch.discount * jnp.where(batch.terminated, 0.0, after)
 
 
-def rescale(controller: Controller, y: Float[Array, " batch"], valid: Bool[Array, " batch"]) -> Controller:
+def rescale(
+    controller: DoubleQController, y: Float[Array, " batch"], valid: Bool[Array, " batch"]
+) -> DoubleQController:
     """The controller with u updated by the targets of one more batch; Q stays the same."""
     old = controller.unit
     rate = jnp.maximum(1 / (old.batches + 1), UNIT_RATE)
@@ -141,7 +143,7 @@ def q_loss(
 
 
 def actor_loss(
-    actor: Actor, controller: Controller, batch: Batch, key: Key[Array, ""], regulariser: float
+    actor: OneTrunkActor, controller: DoubleQController, batch: Batch, key: Key[Array, ""], regulariser: float
 ) -> tuple[Float[Array, ""], tuple[Float[Array, " batch"], Float[Array, " batch"]]]:
     """J_π; also returns min_i Q_i(s, ã) / u and log π(ã|s)."""
     action, log_prob, mean = sample(actor, batch.belief, key)
@@ -153,13 +155,13 @@ def actor_loss(
 def update(
     optimisers: Optimisers,
     state: OptimiserState,
-    controller: Controller,
+    controller: DoubleQController,
     batch: Batch,
     key: Key[Array, ""],
     tau: float,
     regulariser: float,
     target_entropy: float | None = None,
-) -> tuple[Controller, OptimiserState, dict[str, Float[Array, ""]]]:
+) -> tuple[DoubleQController, OptimiserState, dict[str, Float[Array, ""]]]:
     """One step of every optimiser, then a soft update of Q̄.
 
     `target_entropy` None is minus the number of action dimensions.
@@ -185,7 +187,7 @@ def update(
     }
     targets = soft_update(controller.targets, critics, tau)
     return (
-        Controller(actor, critics, targets, log_alpha, controller.unit),
+        DoubleQController(actor, critics, targets, log_alpha, controller.unit),
         OptimiserState(s_actor, s_critics, s_alpha),
         metrics,
     )

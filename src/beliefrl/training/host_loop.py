@@ -143,13 +143,12 @@ class HostLoop:
 
     def explore(self, seeds: SeedState, first: int, steps: int) -> tuple[SeedState, Stretch]:
         """Environment steps without updates; 0 only compiles."""
-        log, output, networks = _StretchLog(), self._act(seeds, first), self.agent.networks(seeds.state)
+        log, output = _StretchLog(), self._act(seeds, first)
         if steps == 0:
             self._compile(seeds, output, learns=False)
         for step in range(first, first + steps, self.envs):
             result = self._step(seeds, output, step, log)
-            rest, output, episode = self._go_on(networks, seeds._replace(state=()), result, step)
-            seeds = rest._replace(state=seeds.state)
+            seeds, output, episode = self._proceed(seeds, result, step)
             log.episodes.append(episode)
         return seeds, log.stretch()
 
@@ -161,15 +160,17 @@ class HostLoop:
         for step in range(first, first + rounds * length, self.envs):
             result = self._step(seeds, output, step, log)
             if (step + self.envs - first) % length:
-                rest, output, episode = self._go_on(
-                    self.agent.networks(seeds.state), seeds._replace(state=()), result, step
-                )
-                seeds = rest._replace(state=seeds.state)
+                seeds, output, episode = self._proceed(seeds, result, step)
             else:
                 seeds, output, episode, metrics = self._learn(seeds, result, step)
                 log.metrics.append(metrics)
             log.episodes.append(episode)
         return seeds, log.stretch()
+
+    def _proceed(self, seeds: SeedState, result: StepResult, step: int) -> tuple[SeedState, ActorOutput, Episode]:
+        """Record the results of a step, and act again. Only the networks enter the program, not the whole state."""
+        rest, output, episode = self._go_on(self.agent.networks(seeds.state), seeds._replace(state=()), result, step)
+        return rest._replace(state=seeds.state), output, episode
 
     def _compile(self, seeds: SeedState, output: ActorOutput, learns: bool) -> None:
         """Compile what follows a step of the environments: else a compilation would look like a slow environment."""

@@ -17,10 +17,10 @@ from beliefrl.runs.run import Recorder, Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import initial
-from beliefrl.training.evaluation import agent_of, task_of, tuples
+from beliefrl.training.evaluation import agent_of, task_of
 from beliefrl.training.schedule import Event, Options, capacity
 from beliefrl.training.session import Callback, Session
-from beliefrl.types import UserError
+from beliefrl.types import UserError, tuples
 
 CHANGEABLE = ("steps", "stop_at", "stop_patience", "step_timeout")  # options that may differ when a training continues
 
