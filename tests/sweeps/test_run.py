@@ -56,8 +56,8 @@ class Pretence(Places):
 
 @pytest.fixture(autouse=True)
 def pretend(monkeypatch):
-    monkeypatch.setattr(runs.local, "Local", Pretence)
-    monkeypatch.setattr(runs.local, "slots", lambda workers: ["0", "1", "2"][:workers])
+    monkeypatch.setattr(runs.places, "Local", Pretence)
+    monkeypatch.setattr(runs.places, "slots", lambda workers: ["0", "1", "2"][:workers])
     monkeypatch.setattr(runs, "LOOK_EVERY", 0.0)
     monkeypatch.setattr(Pretence, "fails", "")
     monkeypatch.setattr(Pretence, "started", [])
