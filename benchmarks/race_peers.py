@@ -4,9 +4,10 @@ One race is one agent, task and seed, in a process of its own on one core. It en
 return over the task's line, or when its seconds are spent. An evaluation is 20 episodes with mode actions. Its time is
 not counted; the time of compilation is. benchmarks/README.md says what the agents have in common and what they do not.
 
-    python -m venv /tmp/torch && /tmp/torch/bin/pip install torch==2.13.0 sb3-contrib .
+    python -m venv /tmp/torch && /tmp/torch/bin/pip install torch==2.13.0 sb3-contrib==2.9.2 .
     python -m venv /tmp/memorax && /tmp/memorax/bin/pip install memorax==1.0.1 .
     git clone https://github.com/twni2016/pomdp-baselines /tmp/pomdp-baselines
+    git -C /tmp/pomdp-baselines checkout 28cb5dd
     python -m venv /tmp/pomdp && /tmp/pomdp/bin/pip install torch==2.13.0 gym==0.26.2 future_fstrings tensorboard .
     python benchmarks/race_peers.py --out runs/peers.jsonl --cores 0,1 --minutes 10 --torch /tmp/torch/bin/python \
         --memorax /tmp/memorax/bin/python --pomdp-baselines /tmp/pomdp/bin/python /tmp/pomdp-baselines
