@@ -237,7 +237,7 @@ MISTAKES = {
     f"{MLP} gym:MountainCarContinuous-v0 --observe 1 1": "observe=1 1 has the index 1 twice",
     f"{MLP} gym:Pendulum-v1 --observe first": "cannot be understood",
     f"{MLP} gym:Pendulum-v1 --constants max_episode_steps=0": "max_episode_steps=0 is impossible",
-    f"{MLP} gym:Pendulum-v1 --constants max_episode_steps=long": "max_episode_steps=long is impossible",
+    f"{MLP} gym:Pendulum-v1 --constants max_episode_steps=long": "max_episode_steps='long' is impossible",
     f"{MLP} gym:Pendulum-v1 --constants weight=3": "gym:Pendulum-v1 cannot be made: TypeError",
     f"{MLP} Pendulum-v1": "no task 'Pendulum-v1': did you mean gym:Pendulum-v1?",
     f"{MLP} MountainCarContinuous-v0": "did you mean gym:MountainCarContinuous-v0?",

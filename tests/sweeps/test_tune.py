@@ -114,8 +114,8 @@ class Fake(Places, places.Local):
 def search(monkeypatch, tmp_path):
     """Calls `tune` in a new folder, on fake trainings of four evaluations; returns it with the Fake's record."""
     pytest.importorskip("optuna")
-    monkeypatch.setattr(tuning.local, "Local", Fake)
-    monkeypatch.setattr(tuning.local, "slots", lambda workers: ["0", "1", "2"][:workers])
+    monkeypatch.setattr(tuning.places, "Local", Fake)
+    monkeypatch.setattr(tuning.places, "slots", lambda workers: ["0", "1", "2"][:workers])
     monkeypatch.setattr(tuning, "LOOK_EVERY", 0.0)
     monkeypatch.setattr(Fake, "started", [])
     settings = {"steps": 4 * EVERY, "eval_every": EVERY}

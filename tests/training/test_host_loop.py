@@ -174,6 +174,7 @@ def test_a_training_goes_on_from_a_fault(tmp_path, episodes):
         assert (steps[0], steps[-1]) == ((26, 40) if episodes == 2 else (40, 40))
 
 
+@pytest.mark.slow
 def test_what_was_learned_before_a_fault_is_kept(tmp_path):
     agent = agents.make("sac-mlp", **SHARED, **SMALL["sac-mlp"])
     task = GymnasiumTask(Late, "robot")

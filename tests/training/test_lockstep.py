@@ -24,8 +24,15 @@ from wrong import Fine, Sleeping, Stuck, raising
 ENVS = 3  # with the agent's cycles of 4 steps, a round has 12
 
 
-@pytest.mark.parametrize("hosted", [False, True])
-@pytest.mark.parametrize("task", [Counting(max_steps=7), Counting(ends=3)])
+@pytest.mark.parametrize(
+    ("task", "hosted"),
+    [
+        (Counting(max_steps=7), True),
+        (Counting(ends=3), False),
+        pytest.param(Counting(max_steps=7), False, marks=pytest.mark.slow),
+        pytest.param(Counting(ends=3), True, marks=pytest.mark.slow),
+    ],
+)
 def test_every_environment_is_recorded_with_its_own_episodes(task, hosted):
     agent = CountingAgent()
     if hosted:

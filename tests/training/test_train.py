@@ -93,6 +93,7 @@ def rows(folder, seed, kind):
     return list(Run(folder).rows(seed, kind))
 
 
+@pytest.mark.slow
 def test_a_training_leaves_what_the_documentation_says(trained):
     folder, _ = trained
     files = {"config.json", "metrics", "tensorboard", "checkpoints", "agent.safetensors", "results.json", "curve.png"}
@@ -113,6 +114,7 @@ def test_a_training_leaves_what_the_documentation_says(trained):
     assert rows(folder, 0, "update") != rows(folder, 1, "update")
 
 
+@pytest.mark.slow
 def test_a_training_is_evaluated_in_both_modes(trained):
     folder, printed = trained
     for seed in range(2):
@@ -178,6 +180,7 @@ def test_a_killed_training_can_be_evaluated_and_success_is_reported(tmp_path):
     assert draw_curve(Run(folder)).stat().st_size > 0
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_with_one_sentence(tmp_path):
     settings = SMALL | {"step_start_rl": 400_000}
     command = program(*TRAIN.split(), "--steps", 400_000, "--seeds", 1, *flags(settings), "--out", tmp_path / "run")
