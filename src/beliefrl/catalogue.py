@@ -3,7 +3,7 @@
 Nothing here imports JAX, so the command line lists names at once. Descriptions of agents and tasks are read from the
 source of their classes. A known environment is a Gymnasium environment whose velocities are known.
 
-`gymnasium.make("BeliefRL/PendulumV-v0")` makes one of our tasks. JAX is imported only by that call.
+`gymnasium.make("BeliefRL/PendulumV-v0")` makes one of our tasks. Only this call imports JAX.
 """
 
 import ast

@@ -15,7 +15,7 @@ class UsageError(Exception):
 
 
 def cause(error: OSError) -> str:
-    """What the operating system says of an error; libraries also raise an OSError with a text of their own."""
+    """The operating system's reason for an error, or else the error's own text."""
     return error.strerror or one_line(str(error))
 
 

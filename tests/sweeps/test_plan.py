@@ -96,6 +96,7 @@ def test_a_sweep_that_grows_trains_no_seed_twice():
 def test_entries_are_the_same_as_numbers_and_as_text(tmp_path):
     number, text = (Experiment("vrm", "pendulum", seeds=(0,), observe=observe) for observe in ((0,), "0"))
     assert plan([number]) == plan([text]) == extended(plan([number]), [text])
+    assert plan([Experiment("vrm", "pendulum", observe="velocities")])[0].observe == ("velocities",)
     write(tmp_path, plan([number]))
     path = tmp_path / "sweep.json"
     path.write_text(path.read_text().replace('"0"', "0"))  # as older sweeps have it

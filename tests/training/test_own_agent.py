@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import beliefrl
+from beliefrl import cli
 from beliefrl.agents.vrm import VRMAgent
 from beliefrl.analysis.figures import curve_figure
 from beliefrl.analysis.tables import parameters
@@ -69,6 +70,38 @@ def test_it_is_resumed(run, tmp_path):
     folder = tmp_path / "run"
     before = beliefrl.train(Foreteller(), "pendulum-p", folder, **OPTIONS)
     assert beliefrl.resume(before, 30, agent=Foreteller).results()["step"] == 30
+
+
+@dataclasses.dataclass(frozen=True)
+class Shaped(Foreteller):
+    shape: Any = None
+    scale: float = 1.0
+
+
+@pytest.mark.slow
+def test_one_with_a_function_is_resumed_and_its_numbers_are_compared(tmp_path):
+    folder = tmp_path / "run"
+    beliefrl.train(Shaped(shape=lambda reward: reward), "pendulum-p", folder, **OPTIONS)
+    again = Shaped(shape=lambda reward: 2 * reward)
+    resumed = beliefrl.train(again, "pendulum-p", folder, resume=True, **OPTIONS | {"steps": 30})
+    assert resumed.results()["step"] == 30
+    with pytest.raises(UserError, match=r"was trained with scale=1\.0, not 2\.0"):
+        beliefrl.train(dataclasses.replace(again, scale=2.0), "pendulum-p", folder, resume=True, **OPTIONS)
+
+
+@pytest.mark.parametrize("name", ["report", "callback"])
+def test_an_oserror_of_a_callback_is_not_one_of_the_run(tmp_path, name):
+    def fails(event):
+        raise FileNotFoundError("mine.txt")
+
+    with pytest.raises(FileNotFoundError, match=r"^mine\.txt$"):
+        beliefrl.train(Foreteller(), "pendulum-p", tmp_path / "run", **{name: fails}, **OPTIONS)
+
+
+def test_a_diverged_seed_is_null_in_json(run, monkeypatch, capsys):
+    monkeypatch.setattr("beliefrl.training.evaluation.evaluate", lambda *_, **__: {"mode": {"mean": float("nan")}})
+    cli.main(["evaluate", str(run.folder), "--json"])
+    assert json.loads(capsys.readouterr().out, parse_constant=pytest.fail) == {"mode": {"mean": None}}
 
 
 def readers(run, tmp_path):

@@ -133,6 +133,11 @@ def test_a_strip_has_a_row_for_each_run(tmp_path, run):
     assert (run.folder / "film.pdf").read_bytes().startswith(b"%PDF")
 
 
+def test_frames_are_a_whole_number(run):
+    with pytest.raises(UserError, match=r"^frames=2\.5 is impossible: it must be a whole number from 2 to 100"):
+        films.film([run], frames=2.5)
+
+
 @pytest.mark.slow
 def test_the_commands_write_their_files(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)

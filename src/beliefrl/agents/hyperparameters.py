@@ -71,11 +71,6 @@ def of(agent: Any) -> dict[str, Any]:
     return {field.name: values[field.name] for field in dataclasses.fields(agent) if field.init}
 
 
-def recorded(hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
-    """Those hyperparameters that JSON represents; it cannot represent a function, for example."""
-    return {name: value for name, value in hyperparameters.items() if _is_json(value)}
-
-
 def restored(agent: Any, recorded: Mapping[str, Any]) -> Any:
     """An agent like this one, or of this class, with hyperparameters that were recorded as JSON.
 

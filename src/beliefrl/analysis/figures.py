@@ -14,6 +14,7 @@ from beliefrl.runs.arrays import write_whole
 from beliefrl.runs.run import Run
 from beliefrl.types import UserError, cause
 
+COLOURS = {"sampled": "#1f6f8b", "mode": "#c8553d"}
 KINDS = (".png", ".pdf")
 
 
@@ -65,9 +66,6 @@ def save(figure: Any, path: pathlib.Path) -> pathlib.Path:
         except OSError as error:
             raise UserError(f"{name} cannot be written ({cause(error)}): choose another file.") from None
     return paths(path)[0]
-
-
-COLOURS = {"sampled": "#1f6f8b", "mode": "#c8553d"}
 
 
 def evaluations(run: Run, name: str) -> Curve:

@@ -1,4 +1,5 @@
 """Learning curves of many agents on many tasks: one panel per task, one line per agent (Section 5, Appendices C, F).
+Return and loss of the model on two axes (Section 5.4).
 
 An agent has the same colour in every figure and report. Lines of one agent with different settings have different
 dashes, too. Colour-blind readers can distinguish the agents' colours (simulated after Machado et al. 2009). Their
@@ -21,7 +22,7 @@ COLUMNS = 3
 PANEL = (3.5, 2.7)  # inches
 HANDLE, LETTER = 0.6, 0.072  # inches: of a legend entry without its label, of a letter
 DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (7, 2, 1.5, 2)), (0, (3, 1, 1, 1, 1, 1)))  # lengths in line widths
-AGENTS = {
+AGENTS = {  # colours
     "vrm": "#0072b2",
     "sac-mlp": "#d55e00",
     "sac-lstm": "#009e73",
@@ -250,6 +251,8 @@ def model_loss(group: Group) -> Curve | None:
 
 def draw_elbo(groups: Sequence[Group], out: pathlib.Path, mode: str = "sampled") -> pathlib.Path:
     """Draw return and model loss, mean and S.E.M. over seeds, a panel per agent and task; returns the path of the PNG.
+
+    For VRM the loss is the negative ELBO of the keep-learning model.
 
     Raises:
         UserError: no run has a model that keeps learning, or the files cannot be written.

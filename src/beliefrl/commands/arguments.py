@@ -1,4 +1,4 @@
-"""Parse the arguments of a command with tyro, and report mistakes as clear sentences."""
+"""Parse the arguments of a command with tyro, with value types of our own, and report mistakes as clear sentences."""
 
 import contextlib
 import dataclasses

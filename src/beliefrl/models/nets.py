@@ -23,7 +23,7 @@ LOG_2PI = 1.8378770664093453
 # Keeps the log-probability of a squashed action finite at ±1, as in the authors' code. It also removes the gradient of
 # the correction -log(1 - a² + 1e-6) for large |u|. That gradient should stay near ±2: it is 1.99 at u = 5, 1.54 at 7,
 # and 0 from 8 on. The form without it, -2 (log 2 - u - softplus(-2u)), keeps it, but is another loss: at the actions of
-# of tests/models/golden.npz (|u| up to 2.8) loss_actor differs from the authors' by 4.3e-5 and the actor's gradient by
+# tests/models/golden.npz (|u| up to 2.8) loss_actor differs from the authors' by 4.3e-5 and the actor's gradient by
 # 5.7e-5.
 TANH_EPSILON = 1e-6
 

@@ -1,4 +1,4 @@
-"""Checkpoints: the whole state of a training, written atomically. They handle trees of arrays only.
+"""Checkpoints: the whole state of a training, written atomically. This module handles trees of arrays only.
 
     checkpoints/
       000004-step-12000/     renamed to this name once all of its files are on the disk
@@ -40,7 +40,9 @@ class Found(NamedTuple):
     progress: dict[str, Any]
     tree: Any
     timesteps: Any  # numpy, leaves (*rings, capacity, ...)
-    missing: np.ndarray  # (*rings,), how many of the first timesteps ever added are in no file, nor in the rings
+    missing: (
+        np.ndarray
+    )  # (*rings,), how many of the first timesteps ever added are lost: in no file and not in the rings
     passed_over: list[str]  # one sentence for each newer checkpoint, which is damaged
 
 

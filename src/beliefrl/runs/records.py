@@ -19,6 +19,7 @@ import jax
 
 from beliefrl.types import LARGEST, UserError, cause
 
+PACKAGES = ("beliefrl", "jax", "jaxlib", "equinox", "optax", "numpy")
 Row = dict[str, Any]
 
 
@@ -179,9 +180,6 @@ def _is_mode(mode: Any, seeds: int) -> bool:
 def _are_known(values: Any) -> bool:
     """Whether this is a list of numbers, or None for what a seed does not have."""
     return isinstance(values, list) and all(value is None or _is_number(value) for value in values)
-
-
-PACKAGES = ("beliefrl", "jax", "jaxlib", "equinox", "optax", "numpy")
 
 
 def provenance() -> dict[str, Any]:

@@ -19,6 +19,7 @@ from beliefrl.sweeps.plan import Training
 from beliefrl.sweeps.sources import PLAN
 from beliefrl.types import UserError
 
+RETRIES = 3  # restarts of a training whose machine is lost
 Slot = str  # a core's number, "gpu" and a GPU's name in CUDA_VISIBLE_DEVICES, "any" for any one core, or "-" for all
 
 BEGIN = "==== a training begins ====\n"  # separates sessions in a log
@@ -115,9 +116,6 @@ def _gpus() -> int:
     count = "import jax; print(sum(device.platform == 'gpu' for device in jax.devices()))"
     found = subprocess.run([sys.executable, "-c", count], capture_output=True, text=True)
     return int(found.stdout.strip().splitlines()[-1]) if found.returncode == 0 and found.stdout.strip() else 0
-
-
-RETRIES = 3  # restarts of a training whose machine is lost
 
 
 class Cluster:

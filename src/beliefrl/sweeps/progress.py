@@ -1,4 +1,4 @@
-"""The state and the progress of a sweep, read from the ends of its logs, the time left, and their display."""
+"""The state and the progress of a sweep (from the ends of its logs), the time left, and the display of these."""
 
 import dataclasses
 import pathlib

@@ -12,7 +12,7 @@ from beliefrl.runs.folder import locked
 from beliefrl.sweeps import places, sources
 from beliefrl.sweeps import plan as plans
 from beliefrl.sweeps.plan import Experiment, Training
-from beliefrl.sweeps.progress import SweepStatus
+from beliefrl.sweeps.progress import SweepDisplay, SweepStatus
 from beliefrl.training.stop import Requests, Stopped
 from beliefrl.types import UserError, cause, one_line
 
@@ -22,7 +22,7 @@ ALL = 10_000  # seeds in one run, more than any experiment has
 
 @runtime_checkable
 class Launcher(Protocol):
-    """Where trainings run: this machine (`local`) or a Ray cluster (`cluster`)."""
+    """Where trainings run: this machine (`places.Local`) or a Ray cluster (`places.Cluster`)."""
 
     @property
     def room(self) -> int: ...
@@ -90,7 +90,6 @@ def reporting(folder: pathlib.Path, report: Report | None, progress: bool) -> It
     with contextlib.ExitStack() as stack:
         listeners = [] if report is None else [report]
         if progress:
-            from beliefrl.sweeps.progress import SweepDisplay
             from beliefrl.training.screen import screen
 
             listeners.insert(0, stack.enter_context(SweepDisplay(screen(), folder)))

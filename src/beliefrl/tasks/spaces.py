@@ -17,6 +17,16 @@ from jaxtyping import Float, Int
 from beliefrl.catalogue import KNOWN, PREFIX
 from beliefrl.types import UserError, short
 
+FREE_JOINT, BALL_JOINT, SLIDE_JOINT = 0, 1, 2  # types of MuJoCo's joints; a hinge is 3
+AXES = ("x", "y", "z")
+BODY = (
+    "height above the start (m)",
+    "sin of angle to target",
+    "cos of angle to target",
+    *(f"0.3 v_{axis} (m/s)" for axis in AXES),
+    "roll (rad)",
+    "pitch (rad)",
+)  # of PyBullet's walkers
 MOST_NUMBERS = 4_000  # in an observation: a larger one is considered an image
 FAR = 100  # an observation may leave its declared range by this many times the range's width
 
@@ -100,18 +110,6 @@ def limits(space: Any, indices: Int[np.ndarray, " obs"]) -> tuple[Float[np.ndarr
     with np.errstate(over="ignore"):
         margin = FAR * np.maximum(high - low, 1.0)
     return low - margin, high + margin
-
-
-FREE_JOINT, BALL_JOINT, SLIDE_JOINT = 0, 1, 2  # types of MuJoCo's joints; a hinge is 3
-AXES = ("x", "y", "z")
-BODY = (
-    "height above the start (m)",
-    "sin of angle to target",
-    "cos of angle to target",
-    *(f"0.3 v_{axis} (m/s)" for axis in AXES),
-    "roll (rad)",
-    "pitch (rad)",
-)  # of PyBullet's walkers
 
 
 def observation_names(environment: Any, space: Any, task: str) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""The display of a training: its progress, then its results."""
+"""The display of a training, its progress, then its results; and the tables of `beliefrl show` and `bench all`."""
 
 import dataclasses
 import io

@@ -58,7 +58,6 @@ class Session:
         self.is_stopped = False  # by the callback
         self.ended: str | None = None  # why the training is finished before its last step, a sentence
         self.was_finished = False  # before it was resumed
-        self._from_callback: OSError | None = None  # raised by it, so the run's folder is not the cause
         self.requests = Requests(partial(self._note, "stopping after this block of steps; Ctrl-C again ends at once"))
 
     def run(
@@ -78,9 +77,9 @@ class Session:
                 if networks is not None:
                     initial.write(self.recorder.folder, networks)
                 self._train(restore)
+        except BrokenPipeError:  # the reader of the output has closed it
+            raise
         except OSError as error:
-            if error is self._from_callback or isinstance(error, BrokenPipeError):  # the reader of the output is gone
-                raise
             raise UserError(
                 f"{self.recorder.folder} cannot be written ({cause(error)}): fix that, then "
                 f"`beliefrl resume {as_argument(self.recorder)}` goes on."
@@ -147,11 +146,7 @@ class Session:
 
     def _report(self, event: Event) -> None:
         """Give an event to the callback, which may ask for a stop."""
-        try:
-            answer = self.callback(event)
-        except OSError as error:
-            self._from_callback = error
-            raise
+        answer = self.callback(event)
         is_flag = isinstance(answer, bool | np.bool_ | jax.Array) and np.asarray(answer).dtype == np.bool_
         if is_flag and bool(answer):
             self.is_stopped = True

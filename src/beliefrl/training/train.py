@@ -165,6 +165,10 @@ def _go_on(
         return training.run(None if begins_again else training.restore)
 
 
+class _OfCallback(Exception):
+    """An OSError that `report` or `callback` has raised. `Session` takes an OSError for one of the run's folder."""
+
+
 @contextlib.contextmanager
 def _reporting(run: Run, report: Callback | None, callback: Callback | None, progress: bool) -> Iterator[Callback]:
     """A function that calls the display (unless `progress` is False), `report` and `callback` with an Event.
@@ -172,19 +176,27 @@ def _reporting(run: Run, report: Callback | None, callback: Callback | None, pro
     It returns what `callback` returns.
     """
     with contextlib.ExitStack() as stack:
-        shown = [] if report is None else [report]
+        display: Callback | None = None
         if progress:
             from beliefrl.training.display import TrainingDisplay
             from beliefrl.training.screen import screen
 
-            shown.insert(0, stack.enter_context(TrainingDisplay(screen(), run)))
+            display = stack.enter_context(TrainingDisplay(screen(), run))
 
         def listen(event: Event) -> Any:
-            for show in shown:
-                show(event)
-            return None if callback is None else callback(event)
+            if display is not None:
+                display(event)
+            try:
+                if report is not None:
+                    report(event)
+                return None if callback is None else callback(event)
+            except OSError as error:
+                raise _OfCallback from error
 
-        yield listen
+        try:
+            yield listen
+        except _OfCallback as error:
+            raise error.__cause__ or error from None
 
 
 def _chosen(options: dict[str, Any]) -> Options:
@@ -212,7 +224,7 @@ def _check_possible(options: Options, task: Any, own_process: bool) -> None:
 def _check_same(run: Run, config: dict[str, Any]) -> None:
     """Raise a UserError if a run was trained with other settings than those of `config`, except CHANGEABLE options."""
     asked = {name: config.get(name) for name in ("agent", "task", "constants", "observe", "faults")}
-    asked |= config["options"] | hyperparameters.recorded(config["hyperparameters"])
+    asked |= config["options"] | _with_functions_of(run.config["hyperparameters"], config["hyperparameters"])
     asked = json.loads(json.dumps(asked, default=str))  # tuples are lists in the run's config
     before = {"faults": None} | dataclasses.asdict(Options())  # what an older version did not record, it did not have
     there = before | run.config | run.config["options"] | run.config["hyperparameters"]
@@ -221,6 +233,14 @@ def _check_same(run: Run, config: dict[str, Any]) -> None:
         if there.get(name, value) != value:
             change = "choose another --out, in Python out="
             raise UserError(f"{run.folder} was trained with {name}={there[name]}, not {value}: {change}.")
+
+
+def _with_functions_of(there: Any, asked: Any) -> Any:
+    """The hyperparameters `asked`, with functions as they are recorded `there`: as text with an address."""
+    if isinstance(asked, dict):
+        known = there if isinstance(there, dict) else {}
+        return {name: _with_functions_of(known.get(name), value) for name, value in asked.items()}
+    return there if callable(asked) and not isinstance(asked, type) else asked
 
 
 def _options(run: Run) -> dict[str, Any]:

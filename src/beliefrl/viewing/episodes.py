@@ -1,4 +1,4 @@
-"""Play one episode of a trained agent on any task, and record every timestep.
+"""Play one episode of a trained agent on any task, record every timestep, and render it.
 
     trajectory = beliefrl.play("runs/first", at=range(0, 200, 20))
     trajectory.total, trajectory.steps.obs, trajectory.frames[20]
