@@ -133,6 +133,7 @@ def test_a_strip_has_a_row_for_each_run(tmp_path, run):
     assert (run.folder / "film.pdf").read_bytes().startswith(b"%PDF")
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_frames_are_a_whole_number(run):
     with pytest.raises(UserError, match=r"^frames=2\.5 is impossible: it must be a whole number from 2 to 100"):
         films.film([run], frames=2.5)
