@@ -1,4 +1,4 @@
-"""What a training keeps in memory and on the disk, and whether that is enough to resume it.
+"""What a training keeps in memory and on the disk, and whether killed trainings resume exactly.
 
     python benchmarks/storage.py replay             # the memory of a full replay
     python benchmarks/storage.py checkpoint         # the cost of checkpoints

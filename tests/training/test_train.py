@@ -13,6 +13,7 @@ import jax
 import numpy as np
 import pytest
 
+import inputs
 from beliefrl import Options, Run, UserError, agents, resume, tasks, train
 from beliefrl.analysis.figures import draw_curve
 from beliefrl.runs import arrays
@@ -21,18 +22,7 @@ from beliefrl.training.schedule import Phase
 from worlds import saved, tiny
 
 TRAIN = "train vrm pendulum-v"
-SMALL = {
-    "step_start_rl": 20,
-    "policy_layers": (8, 8),
-    "value_layers": (8, 8),
-    "train_times_fivrm": 5,
-    "seq_len": 8,
-    "batch_size": 2,
-    "burn_in": 4,
-    "d_size": 8,
-    "z_size": 4,
-    "hidden_size": 8,
-}
+SMALL = inputs.SMALL | {"step_start_rl": 20, "train_times_fivrm": 5, "seq_len": 8}
 OPTIONS = {"steps": 60, "seeds": 2, "seed": 0, "eval_every": 30, "eval_episodes": 2}
 
 

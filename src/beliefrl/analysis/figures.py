@@ -70,7 +70,11 @@ def save(figure: Any, path: pathlib.Path) -> pathlib.Path:
 
 def evaluations(run: Run, name: str) -> Curve:
     """An entry of the evaluations of all seeds of a run, as in `Group.curve`."""
-    return Group(task_of(run), run.config["agent"], [(run, seed) for seed in run.seeds]).curve(name)
+    return _group(run).curve(name)
+
+
+def _group(run: Run) -> Group:
+    return Group(task_of(run), run.config["agent"], [(run, seed) for seed in run.seeds])
 
 
 def axis_label(measure: str) -> str:
@@ -105,7 +109,7 @@ def curve_figure(run: Run) -> Any:
     Raises:
         UserError: there is no evaluation yet.
     """
-    group = Group(task_of(run), run.config["agent"], [(run, seed) for seed in run.seeds])
+    group = _group(run)
     if not group.curve("sampled").steps.size:
         raise UserError(f"{run.folder} has no evaluation of every seed yet, so there is no curve to draw.")
     panels = ["", *group.measures]

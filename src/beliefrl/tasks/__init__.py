@@ -292,11 +292,8 @@ def describe(task: Any) -> dict[str, Any]:
 
 def _describe_gymnasium(task: GymnasiumTask) -> dict[str, Any]:
     base, mask = (task.name[:-2], MASKS[task.name[-2:]]) if task.name[-2:] in MASKS else (task.name, None)
-    constants = dict(task.arguments)
-    if mask is not None and base in ROBOTS:
-        if task.indices == getattr(ROBOTS[base], mask):
-            return {"task": task.name, "constants": constants, "observe": None}
-    else:
-        base = task.name
-    observe = None if task.indices is None else list(task.indices)  # of the full observation, which the base name has
-    return {"task": base, "constants": constants, "observe": observe}
+    robot = None if mask is None else ROBOTS.get(base)
+    implied = robot is not None and task.indices == getattr(robot, str(mask))
+    name = base if robot is not None and not implied else task.name  # the indices are of the full observation
+    observe = None if implied or task.indices is None else list(task.indices)
+    return {"task": name, "constants": dict(task.arguments), "observe": observe}

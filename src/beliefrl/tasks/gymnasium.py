@@ -4,6 +4,7 @@ Such a task runs on the host, not in a compiled program (`host_loop`). It has a 
 episodes follow the same rules as those of `rollout`. This module checks everything that an environment returns.
 """
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Mapping
 from functools import cached_property
@@ -176,10 +177,8 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def close(self) -> None:
         """Close the environment, ignoring errors."""
-        try:
+        with contextlib.suppress(Exception):
             self.inner.close()
-        except Exception:
-            return
 
     def _fault(self, what: str) -> Fault:
         seed = f"{self.seed}, " if self.seed else ""
