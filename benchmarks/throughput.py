@@ -1,4 +1,4 @@
-"""How fast trainings run: in the compiled loop and in the host loop, with several environments, with a program per core.
+"""How fast trainings run: in the compiled loop and the host loop, with several environments, with a program per core.
 
     python benchmarks/throughput.py host-loop          # the host loop and the compiled loop
     python benchmarks/throughput.py envs               # a slow Gymnasium environment, by the number of environments
