@@ -85,8 +85,9 @@ class PredictiveSACAgent(ControllerAgent):
     """Adam's learning rate for log α, the temperature."""
     alpha_start: float = 0.1
     """α before training, in units of the returns."""
-    tau: float = 0.005
-    """Soft-update rate of the target Qs, in [0, 1]."""
+    tau: float = 0.02
+    """Soft-update rate of the target Qs, in [0, 1]. It limits how fast values spread back in time: n_step steps in
+    1/τ updates."""
     policy_layers: tuple[int, ...] = (128, 128)
     """Hidden layers of the actor."""
     value_layers: tuple[int, ...] = (128, 128)
@@ -118,6 +119,7 @@ class PredictiveSACAgent(ControllerAgent):
 
     ranges = ControllerAgent.ranges | {
         "batch_size": (64, 128, 256, 512),
+        "tau": Range(5e-3, 5e-2, "log"),
         "lr_model": Range(1e-4, 3e-3, "log"),
         "seq_len": (16, 32, 64),
         "d_size": (64, 128, 256),
