@@ -76,7 +76,7 @@ def main(peer: str) -> None:
 if __name__ == "__main__":
     if len(sys.argv) == 3 and sys.argv[1] == "--run":
         print({"ours": ours, "theirs": theirs}[sys.argv[2]]())
-    elif len(sys.argv) == 2:
+    elif len(sys.argv) == 2 and not sys.argv[1].startswith("-"):
         main(sys.argv[1])
     else:
-        raise SystemExit(__doc__)
+        sys.exit("usage: python benchmarks/race_sbx.py PYTHON_WITH_SBX")
