@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from beliefrl.agents.predictive_sac import PredictiveSACAgent, draw
+from beliefrl.agents.predictive_sac import PredictiveSACAgent
 from beliefrl.models.nets import standardise
-from beliefrl.models.predictive_model import init_model, prediction_loss
+from beliefrl.models.pool import draw
+from beliefrl.models.predictive_model import average_rewards, init_model, prediction_loss
 from beliefrl.types import UserError
 from inputs import SPEC, changed_where_missing, same, windows
 
@@ -23,8 +24,19 @@ AGENT = PredictiveSACAgent(
     burn_in=4,
     batch_size=16,
     pool=3,
+    reward_memory=(2.0, 10.0),
 )
 TIME, COUNT = 11, 12  # timesteps of a window, transitions of a cycle
+
+
+def noted(window):
+    """The window with the notes of an actor that began with an empty memory."""
+    before, notes = jnp.zeros((window.step.reward.shape[1], 2)), []
+    for t in range(len(window.step.reward)):
+        before = jnp.where(window.step.is_first[t][:, None], 0.0, before)
+        before = before + (window.step.reward[t][:, None] - before) / jnp.array([[2.0, 10.0]])
+        notes.append(before)
+    return window._replace(note=jnp.stack(notes))
 
 
 @pytest.fixture(scope="module")
@@ -35,27 +47,49 @@ def state():
 @pytest.fixture(scope="module")
 def begun(state):
     """The state after a cycle was begun on some windows, those windows, and the batches."""
-    window = windows(jax.random.key(1), 2, TIME)
+    window = noted(windows(jax.random.key(1), 2, TIME))
     return *jax.jit(AGENT.begin_cycle)(state, window, jax.random.key(2))[:2], window
 
 
 def test_acting_forms_the_belief_that_replay_forms(state):
     first = jnp.zeros((1, TIME), bool).at[0, jnp.array([0, 5])].set(True)
-    step = windows(jax.random.key(1), 1, TIME, first).step
-    at_once = jax.jit(lambda: state.model.unroll(AGENT.perception(state.scales, step), step.is_first, 4))()
+    window = noted(windows(jax.random.key(1), 1, TIME, first))
+    step = window.step
+    inputs = AGENT.model_input(state.scales, AGENT.perception(state.scales, step), window.note)
+    at_once = jax.jit(lambda: state.model.unroll(inputs, step.is_first, 4))()
     memory, act = AGENT.reset(SPEC), jax.jit(AGENT.act)
     for t in range(TIME):
         now = jax.tree.map(lambda leaf, t=t: leaf[t, 0], step)
+        memory = AGENT.reset(SPEC) if now.is_first else memory
         _, memory = act(state, memory, now, jax.random.key(t), jnp.array(False))
+        np.testing.assert_allclose(AGENT.note(memory), window.note[t, 0], rtol=1e-5, atol=1e-6)
         if t >= 4:
-            np.testing.assert_allclose(memory.d, at_once[t - 4, 0], rtol=1e-5, atol=1e-6)
+            np.testing.assert_allclose(memory.lstm.d, at_once[t - 4, 0], rtol=1e-5, atol=1e-6)
+
+
+def test_a_belief_in_the_replay_remembers_rewards_from_before_its_window(state):
+    window = noted(windows(jax.random.key(1), 2, TIME))
+    long_ago = window._replace(note=window.note.at[:, 0].add(1.0))  # a reward before the window
+    learn = jax.jit(AGENT.learn_model)
+    plain, other = learn(state, window)[1], learn(state, long_ago)[1]
+    d = AGENT.d_size
+    assert (jnp.abs(plain - other)[:, 0, :d].max(axis=-1) > 1e-4).all()
+    np.testing.assert_allclose(plain[..., d:], other[..., d:], rtol=1e-5)  # x_t has no memory
+
+
+def test_the_averages_of_rewards_are_exponential():
+    averages = jnp.zeros(2)
+    for reward in (1.0, 0.0, 3.0):
+        averages = average_rewards(averages, jnp.array(reward), (2.0, 10.0))
+    np.testing.assert_allclose(averages, [1 / 8 + 3 / 2, 0.1 * 0.9**2 + 0.3], rtol=1e-6)
 
 
 def test_transitions_in_the_pool_are_aligned_in_time(state, begun):
     after, _, window = begun
     pool, step = jax.tree.map(lambda leaf: leaf[0], after.pool.transitions), window.step
     x = AGENT.perception(after.scales, step)  # the scales of this cycle, the model before its update
-    belief = jnp.concatenate([state.model.unroll(x, step.is_first, 4), x[4:]], axis=-1)
+    inputs = AGENT.model_input(after.scales, x, window.note)
+    belief = jnp.concatenate([state.model.unroll(inputs, step.is_first, 4), x[4:]], axis=-1)
     for t, sequence in ((0, 0), (2, 1), (5, 1)):
         row, now, m = 2 * t + sequence, 4 + t, min(AGENT.n_step, 6 - t)
         np.testing.assert_allclose(pool.belief[row], belief[t, sequence], rtol=1e-4, atol=1e-5)
@@ -74,7 +108,7 @@ def test_a_batch_is_standardised_and_drawn_from_all_cycles_in_the_pool(state, be
 
     begin, seen = jax.jit(AGENT.begin_cycle), after
     for number in range(4):  # the pool has room for three cycles
-        seen, _, _ = begin(seen, windows(jax.random.key(10 + number), 2, TIME), jax.random.key(number))
+        seen, _, _ = begin(seen, noted(windows(jax.random.key(10 + number), 2, TIME)), jax.random.key(number))
         cycles = min(number + 2, 3)
         stored = set(np.asarray(seen.pool.transitions.reward)[:cycles].ravel().tolist())
         drawn = set(np.asarray(draw(seen.pool, jax.random.key(3), (8, 64)).reward).ravel().tolist())
@@ -90,9 +124,31 @@ def test_the_controller_sends_no_gradient_into_the_model(state, begun):
     assert not same(learned.controller.actor, after.controller.actor)
 
 
+def test_what_is_evaluated_is_an_average_of_the_last_weights(state, begun):
+    """The first update replaces the average; from then on it follows at its rate, but at least as a plain mean."""
+    agent = dataclasses.replace(AGENT, average_rate=0.4)
+    begin, update, weights = jax.jit(agent.begin_cycle), jax.jit(agent.update), []
+    for number in range(4):
+        window = noted(windows(jax.random.key(number), 2, TIME))
+        state, batches, _ = begin(state, window, jax.random.key(number))
+        state, _ = update(state, jax.tree.map(lambda leaf: leaf[0], batches), jax.random.key(number))
+        weights.append((state.model.lstm.w_d, state.controller.actor.network.layers[0].weight))
+    expected = weights[0]
+    for rate, newest in zip((1 / 2, 0.4, 0.4), weights[1:], strict=True):
+        expected = [old + rate * (new - old) for old, new in zip(expected, newest, strict=True)]
+    trained = agent.networks(state)
+    found = trained.model.lstm.w_d, trained.controller.actor.network.layers[0].weight
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7), tuple(expected), found)
+    assert same(trained.controller.critics, state.controller.critics)
+    newest = dataclasses.replace(AGENT, average_rate=1.0)
+    after, batches, _ = begun
+    learned, _ = jax.jit(newest.update)(after, jax.tree.map(lambda leaf: leaf[0], batches), jax.random.key(4))
+    assert same(newest.networks(learned).model, learned.model)
+
+
 def test_pretraining_teaches_the_model_to_predict(state):
     """Of a world in which the next observation is the action before and the reward is an entry of it."""
-    window = windows(jax.random.key(1), 2, TIME)
+    window = noted(windows(jax.random.key(1), 2, TIME))
     step = window.step
     action = step.prev_action
     obs = jnp.concatenate([jnp.zeros((1, 2, 3)), action[:-1, :, jnp.array([0, 1, 0])]])
@@ -109,14 +165,16 @@ def test_pretraining_teaches_the_model_to_predict(state):
 def test_what_does_not_exist_changes_nothing(state):
     exists = jnp.ones((2, TIME), bool).at[0, :3].set(False).at[1, -2:].set(False)
     first = jnp.zeros((2, TIME), bool).at[0, 3].set(True).at[1, 0].set(True)  # as the replay marks the oldest timestep
-    results = changed_where_missing(AGENT, state, windows(jax.random.key(1), 2, TIME, first), exists)
+    window = noted(windows(jax.random.key(1), 2, TIME, first))
+    results = changed_where_missing(AGENT, state, window, exists)
     (a, metrics_a), (b, metrics_b) = results
     for x, y in ((a.model, b.model), (a.controller, b.controller), (metrics_a, metrics_b)):
         jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-6), x, y)
 
 
 @pytest.mark.parametrize(
-    ("field", "value"), [("pool", 0), ("long_memories", 1.5), ("n_step", 0), ("alpha_start", -1.0)]
+    ("field", "value"),
+    [("pool", 0), ("long_memories", 1.5), ("n_step", 0), ("alpha_start", -1.0), ("average_rate", 0.0)],
 )
 def test_impossible_values_are_refused(field, value):
     with pytest.raises(UserError, match=f"{field}={value} is impossible"):
@@ -126,7 +184,7 @@ def test_impossible_values_are_refused(field, value):
 # A recurrent model that learns only to predict: its memories, its loss, and its burn-in.
 
 OBS, ACTION, D = 3, 2, 8
-SIZES = OBS, ACTION, D, 6
+SIZES = OBS, ACTION, 2, D, 6
 
 
 def model(long_memories=0.25, longest=50):

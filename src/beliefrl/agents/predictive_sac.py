@@ -1,9 +1,9 @@
 """Predictive SAC: a soft actor-critic on the state of one LSTM that learns only to predict.
 
 The belief is s_t = [h_t, x_t], with the LSTM's state h_t and x_t = (o_t, a_{t-1}, r_{t-1}), all standardised by
-running statistics. The LSTM learns during the whole training, and only by predicting the next observation and reward
-(`models.predictive_model`). The controller (`models.double_q`) learns on the belief. Its gradient does not reach the
-LSTM.
+running statistics. The LSTM also reads slow averages of the rewards since the start of the episode. It learns during
+the whole training, and only by predicting the next observation and reward (`models.predictive_model`). The controller
+(`models.double_q`) learns on the belief. Its gradient does not reach the LSTM.
 
 This agent is not from the paper. It keeps the paper's idea: a recurrent model that learns by prediction forms the
 belief, and a soft actor-critic acts on it. It differs from `vrm` in this: one model instead of two, without latent
@@ -12,6 +12,10 @@ variables and without a frozen copy; standardised inputs; returns of several ste
 One unroll of the windows of a cycle serves both: the model learns from it, and its beliefs become transitions. A pool
 has the transitions of the last `pool` cycles, and the controller's batches are drawn from it. The windows of one cycle
 are too few and too correlated for a batch.
+
+In training the newest weights act. Evaluations and the trained agent have an average of the last weights of the model
+and of the actor (Polyak and Juditsky 1992). One update can make a policy lose what it had learned, and the average does
+not follow a single update.
 """
 
 import dataclasses
@@ -20,11 +24,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents.base import ControllerAgent, Metrics, Range
-from beliefrl.models import double_q
-from beliefrl.models.double_q import DoubleQController
+from beliefrl.models import double_q, pool
+from beliefrl.models.double_q import DoubleQController, OneTrunkActor
 from beliefrl.models.nets import (
     LSTMState,
     RunningStatistics,
@@ -33,8 +37,9 @@ from beliefrl.models.nets import (
     standardise,
     update_statistics,
 )
-from beliefrl.models.predictive_model import PredictiveModel, init_model, prediction_loss
-from beliefrl.models.soft_actor_critic import Batch, OptimiserState
+from beliefrl.models.pool import Pool
+from beliefrl.models.predictive_model import PredictiveModel, average_rewards, init_model, prediction_loss
+from beliefrl.models.soft_actor_critic import Batch, OptimiserState, soft_update
 from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range, transitions
 
 
@@ -43,14 +48,22 @@ class Scales(NamedTuple):
 
     obs: RunningStatistics
     reward: RunningStatistics
+    averages: RunningStatistics
     belief: RunningStatistics
 
 
-class Pool(NamedTuple):
-    """The transitions of the last cycles, beliefs not standardised."""
+class Memory(NamedTuple):
+    """The recurrent state of an actor."""
 
-    transitions: Batch  # leaves (pool, windows · length, ...)
-    cycles: Int[Array, ""]  # so far
+    lstm: LSTMState
+    averages: Float[Array, "*batch averages"]  # m_t, of past rewards, in units of the reward
+
+
+class Average(NamedTuple):
+    """Averages of the last weights."""
+
+    model: PredictiveModel
+    actor: OneTrunkActor
 
 
 class State(NamedTuple):
@@ -62,6 +75,7 @@ class State(NamedTuple):
     pool: Pool
     model_optimiser: optax.OptState
     controller_optimiser: OptimiserState
+    average: Average
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,8 +128,13 @@ class PredictiveSACAgent(ControllerAgent):
     """Fraction of the LSTM's cells that start with a long memory, in [0, 1]."""
     longest_memory: int = 127
     """Steps over which the slowest of these cells forgets at the start of the training."""
+    reward_memory: tuple[float, ...] = (8.0, 64.0, 512.0)
+    """Time constants, in steps, of the averages of past rewards that the LSTM reads; () is none."""
     pool: int = 8
     """Number of the last cycles whose transitions are in the pool."""
+    average_rate: float = 2e-3
+    """Rate at which the evaluated agent, an average of the last weights, follows them at each update, in (0, 1]. 1: the
+    newest weights are evaluated."""
 
     ranges = ControllerAgent.ranges | {
         "batch_size": (64, 128, 256, 512),
@@ -135,6 +154,9 @@ class PredictiveSACAgent(ControllerAgent):
         check_range(self, ("burn_in", "pretrain_updates"), 0)
         check_range(self, ("alpha_start",), 1e-6)
         check_range(self, ("lr_model", "long_memories"), 0, 1)
+        check_range(self, ("average_rate",), 1e-6, 1)
+        if self.reward_memory != ():
+            check_range(self, ("reward_memory",), 1)
 
     # How it is trained
 
@@ -160,29 +182,32 @@ class PredictiveSACAgent(ControllerAgent):
 
     def init(self, key: Key[Array, ""], spec: Spec) -> State:
         key_model, key_controller = jax.random.split(key)
-        sizes = spec.obs_dim, spec.action_dim
+        sizes = spec.obs_dim, spec.action_dim, len(self.reward_memory)
         model = init_model(key_model, *sizes, self.d_size, self.hidden_size, self.long_memories, self.longest_memory)
         belief = self.d_size + spec.obs_dim + spec.action_dim + 1
         layers = self.policy_layers, self.value_layers
         controller = double_q.init_controller(key_controller, belief, spec.action_dim, *layers, self.alpha_start)
-        scales = Scales(*map(initial_statistics, (spec.obs_dim, 1, belief)))
-        model_optimiser = self.model_optimiser.init(model)  # pyright: ignore[reportArgumentType]
-        pool = self.empty_pool(belief, spec.action_dim)
+        scales = Scales(*map(initial_statistics, (spec.obs_dim, 1, len(self.reward_memory), belief)))
         return State(
-            model, controller, scales, pool, model_optimiser, double_q.init_optimisers(self.optimisers, controller)
+            model,
+            controller,
+            scales,
+            pool.empty((self.pool, self.sequences * self.seq_len), belief, spec.action_dim),
+            self.model_optimiser.init(model),  # pyright: ignore[reportArgumentType]
+            double_q.init_optimisers(self.optimisers, controller),
+            jax.tree.map(jnp.copy, Average(model, controller.actor)),
         )
 
-    def empty_pool(self, belief: int, action: int) -> Pool:
-        def zeros(*shape: int) -> Float[Array, "pool transitions *shape"]:
-            return jnp.zeros((self.pool, self.sequences * self.seq_len, *shape))
-
-        none = zeros().astype(bool)
-        batch = Batch(zeros(belief), zeros(belief), zeros(action), zeros(), none, zeros(), none)
-        return Pool(batch, jnp.zeros((), int))
-
     def networks(self, state: State) -> State:
-        """The state without its optimisers and the pool."""
-        return state._replace(pool=(), model_optimiser=(), controller_optimiser=())
+        """The state with the averages in place of the newest weights, without its optimisers and the pool."""
+        return state._replace(
+            model=state.average.model,
+            controller=state.controller._replace(actor=state.average.actor),
+            pool=(),
+            model_optimiser=(),
+            controller_optimiser=(),
+            average=(),
+        )
 
     # Acting
 
@@ -191,36 +216,47 @@ class PredictiveSACAgent(ControllerAgent):
         obs, reward = standardise(scales.obs, step.obs), standardise(scales.reward, step.reward[..., None])
         return jnp.concatenate([obs, step.prev_action, reward], axis=-1)
 
-    def reset(self, spec: Spec) -> LSTMState:
-        return LSTMState(jnp.zeros(self.d_size), jnp.zeros(self.d_size))
+    def model_input(
+        self, scales: Scales, x: Float[Array, "*batch x"], averages: Float[Array, "*batch averages"]
+    ) -> Float[Array, "*batch input"]:
+        """[x_t, m_t], m_t standardised."""
+        return jnp.concatenate([x, standardise(scales.averages, averages)], axis=-1)
+
+    def reset(self, spec: Spec) -> Memory:
+        empty = LSTMState(jnp.zeros(self.d_size), jnp.zeros(self.d_size))
+        return Memory(empty, jnp.zeros(len(self.reward_memory)))
 
     def act(
-        self, state: State, memory: LSTMState, step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]
-    ) -> tuple[Float[Array, " action"], LSTMState]:
+        self, state: State, memory: Memory, step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]
+    ) -> tuple[Float[Array, " action"], Memory]:
         x = self.perception(state.scales, step)
-        memory = state.model.next_state(memory, x, step.is_first)
-        belief = standardise(state.scales.belief, jnp.concatenate([memory.d, x]))
-        return self.choose(state.controller, belief, key, explore), memory
+        averages = average_rewards(memory.averages, step.reward, self.reward_memory)
+        lstm = state.model.next_state(memory.lstm, self.model_input(state.scales, x, averages), step.is_first)
+        belief = standardise(state.scales.belief, jnp.concatenate([lstm.d, x]))
+        return self.choose(state.controller, belief, key, explore), Memory(lstm, averages)
 
-    def note(self, memory: LSTMState) -> tuple[()]:
-        return ()
+    def note(self, memory: Memory) -> Float[Array, " averages"]:
+        """m_t."""
+        return memory.averages
 
     # Learning the model
 
     def pretrain(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Metrics]:
         state, _, metrics = self.learn_model(state, windows)
-        return state, metrics
+        return state._replace(average=state.average._replace(model=state.model)), metrics
 
     def learn_model(self, state: State, windows: Window) -> tuple[State, Float[Array, "kept batch belief"], Metrics]:
         """One Adam step on J_model; also returns the beliefs after the burn-in, formed before the step."""
         scales, step = state.scales, windows.step
         obs = update_statistics(scales.obs, step.obs, windows.exists)
         reward = update_statistics(scales.reward, step.reward[..., None], windows.exists & ~step.is_first)
-        scales = scales._replace(obs=obs, reward=reward)
+        averages = update_statistics(scales.averages, windows.note, windows.exists)
+        scales = scales._replace(obs=obs, reward=reward, averages=averages)
         x = self.perception(scales, step)
+        inputs = self.model_input(scales, x, windows.note)
 
         def loss(model: PredictiveModel) -> tuple[Float[Array, ""], Float[Array, "kept batch d"]]:
-            d = model.unroll(x, step.is_first, self.burn_in)
+            d = model.unroll(inputs, step.is_first, self.burn_in)
             after = windows.between(self.burn_in + 1, None).step
             target = [standardise(scales.obs, after.obs), standardise(scales.reward, after.reward[..., None])]
             valid = transitions(windows, self.burn_in)
@@ -237,12 +273,11 @@ class PredictiveSACAgent(ControllerAgent):
     def begin_cycle(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Batch, Metrics]:
         """One update of the model; then a batch from the pool for each update of the controller."""
         state, belief, metrics = self.learn_model(state, windows)
-        batch = self.transitions(windows, belief)
-        pool = add(state.pool, jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), batch))
-        batches = draw(pool, key, (self.cycle, self.batch_size))
+        found = pool.add(state.pool, self.transitions(windows, belief))
+        batches = pool.draw(found, key, (self.cycle, self.batch_size))
         scale = state.scales.belief
         beliefs = {name: standardise(scale, getattr(batches, name)) for name in ("belief", "next_belief")}
-        return state._replace(pool=pool), batches._replace(**beliefs), metrics
+        return state._replace(pool=found), batches._replace(**beliefs), metrics
 
     def update(self, state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
         controller, optimiser, metrics = double_q.update(
@@ -255,17 +290,7 @@ class PredictiveSACAgent(ControllerAgent):
             self.actor_regulariser,
             self.target_entropy,
         )
-        return state._replace(controller=controller, controller_optimiser=optimiser), metrics
-
-
-def add(pool: Pool, batch: Batch) -> Pool:
-    """The pool with the transitions of one more cycle, which replace those of the oldest cycle."""
-    index = pool.cycles % len(pool.transitions.reward)
-    return Pool(jax.tree.map(lambda ring, new: ring.at[index].set(new), pool.transitions, batch), pool.cycles + 1)
-
-
-def draw(pool: Pool, key: Key[Array, ""], shape: tuple[int, int]) -> Batch:
-    """Transitions drawn uniformly, leaves (*shape, ...); they include transitions that are not `valid`."""
-    cycles, count = pool.transitions.reward.shape
-    index = jax.random.randint(key, shape, 0, jnp.minimum(pool.cycles, cycles) * count)
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[index], pool.transitions)
+        newest = Average(state.model, controller.actor)
+        rate = jnp.maximum(self.average_rate, 1 / state.pool.cycles)
+        average = soft_update(state.average, newest, rate)
+        return state._replace(controller=controller, controller_optimiser=optimiser, average=average), metrics

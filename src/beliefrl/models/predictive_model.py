@@ -1,15 +1,18 @@
 """A recurrent model that learns only to predict; its state is the belief of `predictive-sac`.
 
-With x_t = (o_t, a_{t-1}, r_{t-1}), observations and rewards in standardised units:
+With x_t = (o_t, a_{t-1}, r_{t-1}), and m_t with an average of the past rewards for each time constant T; observations,
+rewards and averages in standardised units:
 
-    h_t                  = LSTM(h_{t-1}; x_t)
+    m_t                  = m_{t-1} + (r_{t-1} - m_{t-1}) / T,  zero before the first timestep of an episode
+    h_t                  = LSTM(h_{t-1}; [x_t, m_t])
     prediction           = MLP[h_t, a_t]
     J_model              = E ‖prediction - (o_{t+1}, r_t)‖²,  mean over the entries
 
 To predict, h_t must contain the information of the history about the hidden state. Some cells start with a long
 memory: the biases of their forget gates are log U(1, T), so that they forget over up to T steps (Tallec and Ollivier
 2018, "chrono initialisation"). An LSTM with the usual initialisation forgets an event within some tens of steps.
-Predictions one step ahead do not train it to remember longer.
+Predictions one step ahead do not train it to remember longer. The averages m_t remember rewards without learning. The
+replay stores them. So a window that begins in the middle of an episode has the memory of the whole episode.
 """
 
 import equinox as eqx
@@ -27,23 +30,23 @@ class PredictiveModel(eqx.Module):
     lstm: LSTM
     predictor: MLP
 
-    def __init__(self, obs: int, action: int, d: int, hidden: int):
-        """Sizes of observations, actions, the state of the LSTM, and the hidden layer of the predictor."""
-        self.lstm = LSTM(obs + action + 1, d)
+    def __init__(self, obs: int, action: int, averages: int, d: int, hidden: int):
+        """Sizes of o_t, a_t, m_t, the state of the LSTM, and the hidden layer of the predictor."""
+        self.lstm = LSTM(obs + action + 1 + averages, d)
         self.predictor = MLP((d + action, hidden, obs + 1), jax.nn.relu)
 
     def unroll(
-        self, x: Float[Array, "time batch x"], is_first: Bool[Array, "time batch"], burn_in: int
+        self, x: Float[Array, "time batch input"], is_first: Bool[Array, "time batch"], burn_in: int
     ) -> Float[Array, "kept batch d"]:
-        """h_t after the burn-in. The burn-in starts with an empty state and gets no gradient."""
+        """h_t after the burn-in, given [x_t, m_t]. The burn-in starts with an empty state and gets no gradient."""
         start = self.lstm.start(x.shape[1])
         if burn_in:
             burnt_in = jax.lax.stop_gradient(self.lstm).unroll(start, x[:burn_in], is_first[:burn_in])
             start = jax.tree.map(lambda leaf: leaf[-1], burnt_in)
         return self.lstm.unroll(start, x[burn_in:], is_first[burn_in:]).d
 
-    def next_state(self, state: LSTMState, x: Float[Array, " x"], is_first: Bool[Array, ""]) -> LSTMState:
-        """The LSTM's state after x_t."""
+    def next_state(self, state: LSTMState, x: Float[Array, " input"], is_first: Bool[Array, ""]) -> LSTMState:
+        """The LSTM's state after [x_t, m_t]."""
         start = jax.tree.map(lambda leaf: leaf[None], state)
         after = self.lstm.unroll(start, x[None, None], is_first[None, None])
         return jax.tree.map(lambda leaf: leaf[0, 0], after)
@@ -53,12 +56,26 @@ class PredictiveModel(eqx.Module):
         return self.predictor(jnp.concatenate([d, action]))
 
 
+def average_rewards(
+    before: Float[Array, " averages"], reward: Float[Array, ""], constants: tuple[float, ...]
+) -> Float[Array, " averages"]:
+    """m_t, given m_{t-1}, r_{t-1} and the time constants in steps."""
+    return before + (reward - before) / jnp.array(constants)
+
+
 def init_model(
-    key: Key[Array, ""], obs: int, action: int, d: int, hidden: int, long_memories: float, longest_memory: int
+    key: Key[Array, ""],
+    obs: int,
+    action: int,
+    averages: int,
+    d: int,
+    hidden: int,
+    long_memories: float,
+    longest_memory: int,
 ) -> PredictiveModel:
     """A new model. A fraction `long_memories` of its cells forgets over 1 to `longest_memory` steps."""
     key_weights, key_memories = jax.random.split(key)
-    model = draw(key_weights, PredictiveModel(obs, action, d, hidden))
+    model = draw(key_weights, PredictiveModel(obs, action, averages, d, hidden))
     cells = round(long_memories * d)
     steps = jax.random.uniform(key_memories, (cells,), minval=1.0, maxval=float(longest_memory))
     bias = model.lstm.bias.at[d : d + cells].set(jnp.log(steps))  # gates i, f, g, o

@@ -194,8 +194,8 @@ def loss(
     return j_pi + j_v + j_q + j_alpha, metrics
 
 
-def soft_update(target: Network, value: Network, tau: float) -> Network:
-    """Move a target network, such as V̄, by the fraction τ towards the trained network."""
+def soft_update(target: Network, value: Network, tau: float | Float[Array, ""]) -> Network:
+    """Move a target network, such as V̄, or an average of weights by the fraction τ towards the trained network."""
     return jax.tree.map(lambda old, new: old + tau * (new - old), target, value)
 
 

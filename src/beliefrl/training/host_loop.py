@@ -168,8 +168,8 @@ class HostLoop:
         return seeds, log.stretch()
 
     def _proceed(self, seeds: SeedState, result: StepResult, step: int) -> tuple[SeedState, ActorOutput, Episode]:
-        """Record the results of a step, and act again. Only the networks enter the program, not the whole state."""
-        rest, output, episode = self._go_on(self.agent.networks(seeds.state), seeds._replace(state=()), result, step)
+        """Record the results of a step, and act again; the agent's state stays as it is."""
+        rest, output, episode = self._go_on(seeds.state, seeds._replace(state=()), result, step)
         return rest._replace(state=seeds.state), output, episode
 
     def _compile(self, seeds: SeedState, output: ActorOutput, learns: bool) -> None:
@@ -184,7 +184,7 @@ class HostLoop:
         single = phases.round_length(self.agent, self.envs) == self.envs  # updates after every step
         if isinstance(self._go_on, jax.stages.Wrapped) and not (learns and single):
             rest = seeds._replace(state=())
-            self._go_on = self._go_on.lower(self.agent.networks(seeds.state), rest, result, 0).compile()
+            self._go_on = self._go_on.lower(seeds.state, rest, result, 0).compile()
         if learns:
             self._learn = self._learn.lower(seeds, result, 0).compile()
 
@@ -257,10 +257,10 @@ def _record(
 
 
 def _go_on(
-    agent: Agent, spec: Spec, envs: int, networks: Any, rest: SeedState, result: StepResult, step: Int[Array, ""]
+    agent: Agent, spec: Spec, envs: int, state: Any, rest: SeedState, result: StepResult, step: Int[Array, ""]
 ) -> tuple[SeedState, ActorOutput, Episode]:
     """Record, and act again."""
-    seed, episode = _record(agent, spec, envs, rest._replace(state=networks), result, step)
+    seed, episode = _record(agent, spec, envs, rest._replace(state=state), result, step)
     return seed._replace(state=()), _act(agent, envs, seed, step + envs), episode
 
 

@@ -147,7 +147,7 @@ def _stages(
     stretch = phases.stretch_length(agent, envs)
 
     if at.evaluated // options.eval_every < at.step // options.eval_every:  # an environment failed in this evaluation
-        yield from _evaluation(program, seeds, at.step, Phase.LEARNING)
+        yield from _evaluation(agent, program, seeds, at.step, Phase.LEARNING)
         at = at._replace(evaluated=at.step)
         yield Event(Phase.LEARNING, at.step, snapshot=Snapshot(at, seeds))
     if at.step < explored:
@@ -161,7 +161,7 @@ def _stages(
         before, at = at.step, at._replace(step=at.step + steps)
         yield Event(Phase.EXPLORING, at.step, episodes=log.episodes)
         if at.step // options.eval_every > before // options.eval_every:
-            yield from _evaluation(program, seeds, at.step, Phase.EXPLORING)
+            yield from _evaluation(agent, program, seeds, at.step, Phase.EXPLORING)
             at = at._replace(evaluated=at.step)
         yield Event(Phase.EXPLORING, at.step, snapshot=Snapshot(at, seeds))
 
@@ -191,11 +191,11 @@ def _stages(
         before, at = at.step, at._replace(step=at.step + rounds * length)
         yield Event(Phase.LEARNING, at.step, log.metrics, log.episodes)
         if at.step // options.eval_every > before // options.eval_every:
-            yield from _evaluation(program, seeds, at.step, Phase.LEARNING)
+            yield from _evaluation(agent, program, seeds, at.step, Phase.LEARNING)
             at = at._replace(evaluated=at.step)
         yield Event(Phase.LEARNING, at.step, snapshot=Snapshot(at, seeds))
     if at.evaluated < at.step:
-        yield from _evaluation(program, seeds, at.step, Phase.LEARNING)
+        yield from _evaluation(agent, program, seeds, at.step, Phase.LEARNING)
         yield Event(Phase.FINISHED, at.step, snapshot=Snapshot(at._replace(evaluated=at.step), seeds))
 
 
@@ -234,11 +234,11 @@ def _until(step: int, every: int) -> int:
     return every - step % every
 
 
-def _evaluation(program: Program, seeds: SeedState, step: int, then: Phase) -> Iterator[Event]:
+def _evaluation(agent: Agent, program: Program, seeds: SeedState, step: int, then: Phase) -> Iterator[Event]:
     yield Event(Phase.EVALUATING, step)
     keys = jax.vmap(lambda key: jax.random.fold_in(jax.random.fold_in(key, phases.EVALUATE), step))(seeds.key)
     try:
-        result = program.evaluate(seeds.state, keys)
+        result = program.evaluate(agent.networks(seeds.state), keys)
     except Fault as fault:
         fault.seeds, fault.step = seeds, step
         raise
