@@ -29,12 +29,13 @@ AGENT = PredictiveSACAgent(
 TIME, COUNT = 11, 12  # timesteps of a window, transitions of a cycle
 
 
-def noted(window):
-    """The window with the notes of an actor that began with an empty memory."""
+def noted(window, mean=0.0):
+    """The window with the notes of an actor that began with an empty memory; `mean` is r̄."""
     before, notes = jnp.zeros((window.step.reward.shape[1], 2)), []
     for t in range(len(window.step.reward)):
+        deviation = jnp.where(window.step.is_first[t], 0.0, window.step.reward[t] - mean)[:, None]
         before = jnp.where(window.step.is_first[t][:, None], 0.0, before)
-        before = before + (window.step.reward[t][:, None] - before) / jnp.array([[2.0, 10.0]])
+        before = before + (deviation - before) / jnp.array([[2.0, 10.0]])
         notes.append(before)
     return window._replace(note=jnp.stack(notes))
 
@@ -53,7 +54,9 @@ def begun(state):
 
 def test_acting_forms_the_belief_that_replay_forms(state):
     first = jnp.zeros((1, TIME), bool).at[0, jnp.array([0, 5])].set(True)
-    window = noted(windows(jax.random.key(1), 1, TIME, first))
+    rewards = state.scales.reward._replace(mean=jnp.array([0.3]))
+    state = state._replace(scales=state.scales._replace(reward=rewards))
+    window = noted(windows(jax.random.key(1), 1, TIME, first), mean=0.3)
     step = window.step
     inputs = AGENT.model_input(state.scales, AGENT.perception(state.scales, step), window.note)
     at_once = jax.jit(lambda: state.model.unroll(inputs, step.is_first, 4))()
@@ -75,6 +78,17 @@ def test_a_belief_in_the_replay_remembers_rewards_from_before_its_window(state):
     d = AGENT.d_size
     assert (jnp.abs(plain - other)[:, 0, :d].max(axis=-1) > 1e-4).all()
     np.testing.assert_allclose(plain[..., d:], other[..., d:], rtol=1e-5)  # x_t has no memory
+
+
+def test_equal_rewards_tell_no_time(state):
+    """Where all rewards are alike, the averages stay at zero, as on CartPole."""
+    rewards = state.scales.reward._replace(mean=jnp.ones(1))
+    state = state._replace(scales=state.scales._replace(reward=rewards))
+    step, memory = jax.tree.map(lambda leaf: leaf[0, 0], windows(jax.random.key(1), 1, TIME).step), AGENT.reset(SPEC)
+    for t in range(3):
+        now = step._replace(is_first=jnp.array(t == 0), reward=jnp.array(float(t > 0)))
+        _, memory = jax.jit(AGENT.act)(state, memory, now, jax.random.key(t), jnp.array(False))
+    np.testing.assert_array_equal(memory.averages, 0.0)
 
 
 def test_the_averages_of_rewards_are_exponential():

@@ -230,7 +230,8 @@ class PredictiveSACAgent(ControllerAgent):
         self, state: State, memory: Memory, step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]
     ) -> tuple[Float[Array, " action"], Memory]:
         x = self.perception(state.scales, step)
-        averages = average_rewards(memory.averages, step.reward, self.reward_memory)
+        deviation = jnp.where(step.is_first, 0.0, step.reward - state.scales.reward.mean[0])
+        averages = average_rewards(memory.averages, deviation, self.reward_memory)
         lstm = state.model.next_state(memory.lstm, self.model_input(state.scales, x, averages), step.is_first)
         belief = standardise(state.scales.belief, jnp.concatenate([lstm.d, x]))
         return self.choose(state.controller, belief, key, explore), Memory(lstm, averages)

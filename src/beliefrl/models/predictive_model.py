@@ -1,9 +1,9 @@
 """A recurrent model that learns only to predict; its state is the belief of `predictive-sac`.
 
-With x_t = (o_t, a_{t-1}, r_{t-1}), and m_t with an average of the past rewards for each time constant T; observations,
-rewards and averages in standardised units:
+With x_t = (o_t, a_{t-1}, r_{t-1}), observations and rewards in standardised units, and m_t, which has an average of the
+past rewards for each time constant T:
 
-    m_t                  = m_{t-1} + (r_{t-1} - m_{t-1}) / T,  zero before the first timestep of an episode
+    m_t                  = m_{t-1} + (r_{t-1} - r̄ - m_{t-1}) / T,  zero at the first timestep of an episode
     h_t                  = LSTM(h_{t-1}; [x_t, m_t])
     prediction           = MLP[h_t, a_t]
     J_model              = E ‖prediction - (o_{t+1}, r_t)‖²,  mean over the entries
@@ -12,7 +12,9 @@ To predict, h_t must contain the information of the history about the hidden sta
 memory: the biases of their forget gates are log U(1, T), so that they forget over up to T steps (Tallec and Ollivier
 2018, "chrono initialisation"). An LSTM with the usual initialisation forgets an event within some tens of steps.
 Predictions one step ahead do not train it to remember longer. The averages m_t remember rewards without learning. The
-replay stores them. So a window that begins in the middle of an episode has the memory of the whole episode.
+replay stores them. So a window that begins in the middle of an episode has the memory of the whole episode. r̄ is the
+running mean of all rewards. Without it, m_t would tell the time where all rewards are alike. The value of a state would
+then seem to depend on the time.
 """
 
 import equinox as eqx
@@ -57,10 +59,10 @@ class PredictiveModel(eqx.Module):
 
 
 def average_rewards(
-    before: Float[Array, " averages"], reward: Float[Array, ""], constants: tuple[float, ...]
+    before: Float[Array, " averages"], deviation: Float[Array, ""], constants: tuple[float, ...]
 ) -> Float[Array, " averages"]:
-    """m_t, given m_{t-1}, r_{t-1} and the time constants in steps."""
-    return before + (reward - before) / jnp.array(constants)
+    """m_t, given m_{t-1}, r_{t-1} - r̄ and the time constants in steps."""
+    return before + (deviation - before) / jnp.array(constants)
 
 
 def init_model(
