@@ -54,8 +54,8 @@ def begun(state):
 
 def test_acting_forms_the_belief_that_replay_forms(state):
     first = jnp.zeros((1, TIME), bool).at[0, jnp.array([0, 5])].set(True)
-    rewards = state.scales.reward._replace(mean=jnp.array([0.3]))
-    state = state._replace(scales=state.scales._replace(reward=rewards))
+    usual = state.scales.usual._replace(mean=jnp.array([0.3]))
+    state = state._replace(scales=state.scales._replace(usual=usual))
     window = noted(windows(jax.random.key(1), 1, TIME, first), mean=0.3)
     step = window.step
     inputs = AGENT.model_input(state.scales, AGENT.perception(state.scales, step), window.note)
@@ -82,13 +82,20 @@ def test_a_belief_in_the_replay_remembers_rewards_from_before_its_window(state):
 
 def test_equal_rewards_tell_no_time(state):
     """Where all rewards are alike, the averages stay at zero, as on CartPole."""
-    rewards = state.scales.reward._replace(mean=jnp.ones(1))
-    state = state._replace(scales=state.scales._replace(reward=rewards))
+    usual = state.scales.usual._replace(mean=jnp.ones(1))
+    state = state._replace(scales=state.scales._replace(usual=usual))
     step, memory = jax.tree.map(lambda leaf: leaf[0, 0], windows(jax.random.key(1), 1, TIME).step), AGENT.reset(SPEC)
     for t in range(3):
         now = step._replace(is_first=jnp.array(t == 0), reward=jnp.array(float(t > 0)))
         _, memory = jax.jit(AGENT.act)(state, memory, now, jax.random.key(t), jnp.array(False))
     np.testing.assert_array_equal(memory.averages, 0.0)
+
+
+def test_the_usual_reward_is_the_median_and_rare_rewards_do_not_change_it(state):
+    window = noted(windows(jax.random.key(1), 2, TIME))
+    rewards = jnp.ones((TIME, 2)).at[3, 0].set(1000.0).at[0].set(-7.0)  # a reward before a first timestep is none
+    window = window._replace(step=window.step._replace(reward=rewards))
+    np.testing.assert_allclose(jax.jit(AGENT.learn_model)(state, window)[0].scales.usual.mean, [1.0])
 
 
 def test_the_averages_of_rewards_are_exponential():

@@ -48,6 +48,7 @@ class Scales(NamedTuple):
 
     obs: RunningStatistics
     reward: RunningStatistics
+    usual: RunningStatistics  # of the median reward of each update's windows; its mean is r̄
     averages: RunningStatistics
     belief: RunningStatistics
 
@@ -187,7 +188,7 @@ class PredictiveSACAgent(ControllerAgent):
         belief = self.d_size + spec.obs_dim + spec.action_dim + 1
         layers = self.policy_layers, self.value_layers
         controller = double_q.init_controller(key_controller, belief, spec.action_dim, *layers, self.alpha_start)
-        scales = Scales(*map(initial_statistics, (spec.obs_dim, 1, len(self.reward_memory), belief)))
+        scales = Scales(*map(initial_statistics, (spec.obs_dim, 1, 1, len(self.reward_memory), belief)))
         return State(
             model,
             controller,
@@ -230,7 +231,7 @@ class PredictiveSACAgent(ControllerAgent):
         self, state: State, memory: Memory, step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]
     ) -> tuple[Float[Array, " action"], Memory]:
         x = self.perception(state.scales, step)
-        deviation = jnp.where(step.is_first, 0.0, step.reward - state.scales.reward.mean[0])
+        deviation = jnp.where(step.is_first, 0.0, step.reward - state.scales.usual.mean[0])
         averages = average_rewards(memory.averages, deviation, self.reward_memory)
         lstm = state.model.next_state(memory.lstm, self.model_input(state.scales, x, averages), step.is_first)
         belief = standardise(state.scales.belief, jnp.concatenate([lstm.d, x]))
@@ -250,9 +251,11 @@ class PredictiveSACAgent(ControllerAgent):
         """One Adam step on J_model; also returns the beliefs after the burn-in, formed before the step."""
         scales, step = state.scales, windows.step
         obs = update_statistics(scales.obs, step.obs, windows.exists)
-        reward = update_statistics(scales.reward, step.reward[..., None], windows.exists & ~step.is_first)
+        rewarded = windows.exists & ~step.is_first
+        reward = update_statistics(scales.reward, step.reward[..., None], rewarded)
+        usual = update_statistics(scales.usual, median(step.reward, rewarded)[None], jnp.any(rewarded))
         averages = update_statistics(scales.averages, windows.note, windows.exists)
-        scales = scales._replace(obs=obs, reward=reward, averages=averages)
+        scales = scales._replace(obs=obs, reward=reward, usual=usual, averages=averages)
         x = self.perception(scales, step)
         inputs = self.model_input(scales, x, windows.note)
 
@@ -295,3 +298,8 @@ class PredictiveSACAgent(ControllerAgent):
         rate = jnp.maximum(self.average_rate, 1 / state.pool.cycles)
         average = soft_update(state.average, newest, rate)
         return state._replace(controller=controller, controller_optimiser=optimiser, average=average), metrics
+
+
+def median(x: Float[Array, "*shape"], valid: Bool[Array, "*shape"]) -> Float[Array, ""]:
+    """The median of the valid entries; 0 where none is valid."""
+    return jnp.nan_to_num(jnp.nanmedian(jnp.where(valid, x, jnp.nan)))

@@ -13,8 +13,8 @@ memory: the biases of their forget gates are log U(1, T), so that they forget ov
 2018, "chrono initialisation"). An LSTM with the usual initialisation forgets an event within some tens of steps.
 Predictions one step ahead do not train it to remember longer. The averages m_t remember rewards without learning. The
 replay stores them. So a window that begins in the middle of an episode has the memory of the whole episode. r̄ is the
-running mean of all rewards. Without it, m_t would tell the time where all rewards are alike. The value of a state would
-then seem to depend on the time.
+usual reward, the running median. Without it, m_t would tell the time where all rewards are alike. The value of a state
+would then seem to depend on the time.
 """
 
 import equinox as eqx
