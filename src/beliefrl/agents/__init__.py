@@ -58,10 +58,11 @@ class Agent(Protocol):
         ...
 
     def networks(self, state: Any) -> Any:
-        """The state without what only updates need: its optimisers' fields are replaced by ().
+        """The trained agent: the state without what only updates need. Its optimisers' fields are replaced by ().
 
-        Outside of training, `act` and `predict` receive this state. It is saved as the trained agent, and its numbers
-        are counted as parameters. `state` may have leading axes.
+        In evaluations and outside of training, `act` and `predict` receive this state. So it may have averages of the
+        weights in place of the newest. It is saved as the trained agent, and its numbers are counted as parameters.
+        `state` may have leading axes.
         """
         ...
 

@@ -36,6 +36,7 @@ from beliefrl.models.nets import (
     initial_statistics,
     standardise,
     update_statistics,
+    valid_median,
 )
 from beliefrl.models.pool import Pool
 from beliefrl.models.predictive_model import PredictiveModel, average_rewards, init_model, prediction_loss
@@ -200,10 +201,20 @@ class PredictiveSACAgent(ControllerAgent):
         )
 
     def networks(self, state: State) -> State:
-        """The state with the averages in place of the newest weights, without its optimisers and the pool."""
+        """The state with the averages in place of the newest weights, without its optimisers and the pool.
+
+        Before the first update there are no averages, and the newest weights stay.
+        """
+        begun = state.pool.cycles > 0
+
+        def choose(average: Array, newest: Array) -> Array:
+            return jnp.where(begun.reshape(begun.shape + (1,) * (newest.ndim - begun.ndim)), average, newest)
+
+        newest = Average(state.model, state.controller.actor)
+        model, actor = jax.tree.map(choose, state.average, newest)
         return state._replace(
-            model=state.average.model,
-            controller=state.controller._replace(actor=state.average.actor),
+            model=model,
+            controller=state.controller._replace(actor=actor),
             pool=(),
             model_optimiser=(),
             controller_optimiser=(),
@@ -245,7 +256,7 @@ class PredictiveSACAgent(ControllerAgent):
 
     def pretrain(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Metrics]:
         state, _, metrics = self.learn_model(state, windows)
-        return state._replace(average=state.average._replace(model=state.model)), metrics
+        return state, metrics
 
     def learn_model(self, state: State, windows: Window) -> tuple[State, Float[Array, "kept batch belief"], Metrics]:
         """One Adam step on J_model; also returns the beliefs after the burn-in, formed before the step."""
@@ -253,7 +264,7 @@ class PredictiveSACAgent(ControllerAgent):
         obs = update_statistics(scales.obs, step.obs, windows.exists)
         rewarded = windows.exists & ~step.is_first
         reward = update_statistics(scales.reward, step.reward[..., None], rewarded)
-        usual = update_statistics(scales.usual, median(step.reward, rewarded)[None], jnp.any(rewarded))
+        usual = update_statistics(scales.usual, valid_median(step.reward, rewarded)[None], jnp.any(rewarded))
         averages = update_statistics(scales.averages, windows.note, windows.exists)
         scales = scales._replace(obs=obs, reward=reward, usual=usual, averages=averages)
         x = self.perception(scales, step)
@@ -298,8 +309,3 @@ class PredictiveSACAgent(ControllerAgent):
         rate = jnp.maximum(self.average_rate, 1 / state.pool.cycles)
         average = soft_update(state.average, newest, rate)
         return state._replace(controller=controller, controller_optimiser=optimiser, average=average), metrics
-
-
-def median(x: Float[Array, "*shape"], valid: Bool[Array, "*shape"]) -> Float[Array, ""]:
-    """The median of the valid entries; 0 where none is valid."""
-    return jnp.nan_to_num(jnp.nanmedian(jnp.where(valid, x, jnp.nan)))
