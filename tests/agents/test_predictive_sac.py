@@ -147,8 +147,10 @@ def test_the_controller_sends_no_gradient_into_the_model(state, begun):
 
 def test_what_is_evaluated_is_an_average_of_the_last_weights(state, begun):
     """The first update replaces the average; from then on it follows at its rate, but at least as a plain mean."""
-    moved = jax.tree.map(lambda leaf: leaf + 1.0, state.average)
-    assert same(AGENT.networks(state._replace(average=moved)).model, state.model)  # before the first update
+    moved = jax.tree.map(lambda leaf: leaf + 1.0, state.average.weights)
+    assert same(
+        AGENT.networks(state._replace(average=state.average._replace(weights=moved))).model, state.model
+    )  # before the first update
     agent = dataclasses.replace(AGENT, average_rate=0.4)
     begin, update, weights = jax.jit(agent.begin_cycle), jax.jit(agent.update), []
     for number in range(4):

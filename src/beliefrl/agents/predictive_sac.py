@@ -27,8 +27,9 @@ import optax
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents.base import ControllerAgent, Metrics, Range
-from beliefrl.models import double_q, pool
-from beliefrl.models.double_q import DoubleQController, OneTrunkActor
+from beliefrl.models import average, double_q, pool
+from beliefrl.models.average import Average
+from beliefrl.models.double_q import DoubleQController
 from beliefrl.models.nets import (
     LSTMState,
     RunningStatistics,
@@ -40,7 +41,7 @@ from beliefrl.models.nets import (
 )
 from beliefrl.models.pool import Pool
 from beliefrl.models.predictive_model import PredictiveModel, average_rewards, init_model, prediction_loss
-from beliefrl.models.soft_actor_critic import Batch, OptimiserState, soft_update
+from beliefrl.models.soft_actor_critic import Batch, OptimiserState
 from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range, transitions
 
 
@@ -61,13 +62,6 @@ class Memory(NamedTuple):
     averages: Float[Array, "*batch averages"]  # m_t, of past rewards, in units of the reward
 
 
-class Average(NamedTuple):
-    """Averages of the last weights."""
-
-    model: PredictiveModel
-    actor: OneTrunkActor
-
-
 class State(NamedTuple):
     """Everything that training changes."""
 
@@ -77,7 +71,7 @@ class State(NamedTuple):
     pool: Pool
     model_optimiser: optax.OptState
     controller_optimiser: OptimiserState
-    average: Average
+    average: Average  # of the model and the actor
 
 
 @dataclasses.dataclass(frozen=True)
@@ -197,7 +191,7 @@ class PredictiveSACAgent(ControllerAgent):
             pool.empty((self.pool, self.sequences * self.seq_len), belief, spec.action_dim),
             self.model_optimiser.init(model),  # pyright: ignore[reportArgumentType]
             double_q.init_optimisers(self.optimisers, controller),
-            jax.tree.map(jnp.copy, Average(model, controller.actor)),
+            average.begin((model, controller.actor)),
         )
 
     def networks(self, state: State) -> State:
@@ -205,13 +199,7 @@ class PredictiveSACAgent(ControllerAgent):
 
         Before the first update there are no averages, and the newest weights stay.
         """
-        begun = state.pool.cycles > 0
-
-        def choose(average: Array, newest: Array) -> Array:
-            return jnp.where(begun.reshape(begun.shape + (1,) * (newest.ndim - begun.ndim)), average, newest)
-
-        newest = Average(state.model, state.controller.actor)
-        model, actor = jax.tree.map(choose, state.average, newest)
+        model, actor = average.averaged(state.average, (state.model, state.controller.actor))
         return state._replace(
             model=model,
             controller=state.controller._replace(actor=actor),
@@ -305,7 +293,5 @@ class PredictiveSACAgent(ControllerAgent):
             self.actor_regulariser,
             self.target_entropy,
         )
-        newest = Average(state.model, controller.actor)
-        rate = jnp.maximum(self.average_rate, 1 / state.pool.cycles)
-        average = soft_update(state.average, newest, rate)
-        return state._replace(controller=controller, controller_optimiser=optimiser, average=average), metrics
+        followed = average.follow(state.average, (state.model, controller.actor), self.average_rate)
+        return state._replace(controller=controller, controller_optimiser=optimiser, average=followed), metrics

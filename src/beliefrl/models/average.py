@@ -1,0 +1,42 @@
+"""A running average of weights, which does not follow a single update (Polyak and Juditsky 1992).
+
+    w̄ = w̄ + ρ (w - w̄),   ρ = max(rate, 1 / number of the update)
+
+So it is the plain mean of the first 1 / rate weights, and then an exponential average.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from beliefrl.models.soft_actor_critic import soft_update
+
+
+class Average(NamedTuple):
+    """w̄; it has no meaning before the first update."""
+
+    weights: Any
+    updates: Int[Array, "*seed"]
+
+
+def begin(weights: Any) -> Average:
+    """An average without updates, for weights of these shapes."""
+    return Average(jax.tree.map(jnp.copy, weights), jnp.zeros((), int))
+
+
+def follow(average: Average, newest: Any, rate: float) -> Average:
+    """The average after one more update of the weights."""
+    updates = average.updates + 1
+    return Average(soft_update(average.weights, newest, jnp.maximum(rate, 1 / updates)), updates)
+
+
+def averaged(average: Average, newest: Any) -> Any:
+    """The averaged weights, or the newest ones before the first update. Leaves may have leading axes."""
+    begun = average.updates > 0
+
+    def choose(mean: Array, weight: Array) -> Array:
+        return jnp.where(begun.reshape(begun.shape + (1,) * (weight.ndim - begun.ndim)), mean, weight)
+
+    return jax.tree.map(choose, average.weights, newest)
