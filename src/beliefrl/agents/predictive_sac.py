@@ -1,8 +1,8 @@
 """Predictive SAC: a soft actor-critic on the state of one LSTM that learns only to predict.
 
 The belief is s_t = [h_t, x_t], with the LSTM's state h_t and x_t = (o_t, a_{t-1}, r_{t-1}), all standardised by
-running statistics. The LSTM also reads slow averages of the rewards since the start of the episode. It learns during
-the whole training, and only by predicting the next observation and reward (`models.predictive_model`). The controller
+running statistics. The LSTM also reads a memory of the unusual rewards of the episode. It learns during the whole
+training, and only by predicting the next observation and reward (`models.predictive_model`). The controller
 (`models.double_q`) learns on the belief. Its gradient does not reach the LSTM.
 
 This agent is not from the paper. It keeps the paper's idea: a recurrent model that learns by prediction forms the
@@ -37,10 +37,9 @@ from beliefrl.models.nets import (
     initial_statistics,
     standardise,
     update_statistics,
-    valid_median,
 )
 from beliefrl.models.pool import Pool
-from beliefrl.models.predictive_model import PredictiveModel, average_rewards, init_model, prediction_loss
+from beliefrl.models.predictive_model import PredictiveModel, Usual, init_model, prediction_loss, remember
 from beliefrl.models.soft_actor_critic import Batch, OptimiserState
 from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range, transitions
 
@@ -50,16 +49,15 @@ class Scales(NamedTuple):
 
     obs: RunningStatistics
     reward: RunningStatistics
-    usual: RunningStatistics  # of the median reward of each update's windows; its mean is r̄
-    averages: RunningStatistics
     belief: RunningStatistics
+    usual: Usual  # r̄ and δ, from the pre-training
 
 
 class Memory(NamedTuple):
     """The recurrent state of an actor."""
 
     lstm: LSTMState
-    averages: Float[Array, "*batch averages"]  # m_t, of past rewards, in units of the reward
+    rewards: Float[Array, "*batch constants"]  # m_t, in units of the reward
 
 
 class State(NamedTuple):
@@ -125,7 +123,8 @@ class PredictiveSACAgent(ControllerAgent):
     longest_memory: int = 127
     """Steps over which the slowest of these cells forgets at the start of the training."""
     reward_memory: tuple[float, ...] = (8.0, 64.0, 512.0)
-    """Time constants, in steps, of the averages of past rewards that the LSTM reads; () is none."""
+    """Time constants, in steps, of the memory of unusual rewards that the LSTM reads. The pre-training determines which
+    rewards are unusual."""
     pool: int = 8
     """Number of the last cycles whose transitions are in the pool."""
     average_rate: float = 2e-3
@@ -151,8 +150,7 @@ class PredictiveSACAgent(ControllerAgent):
         check_range(self, ("alpha_start",), 1e-6)
         check_range(self, ("lr_model", "long_memories"), 0, 1)
         check_range(self, ("average_rate",), 1e-6, 1)
-        if self.reward_memory != ():
-            check_range(self, ("reward_memory",), 1)
+        check_range(self, ("reward_memory",), 1)
 
     # How it is trained
 
@@ -183,7 +181,7 @@ class PredictiveSACAgent(ControllerAgent):
         belief = self.d_size + spec.obs_dim + spec.action_dim + 1
         layers = self.policy_layers, self.value_layers
         controller = double_q.init_controller(key_controller, belief, spec.action_dim, *layers, self.alpha_start)
-        scales = Scales(*map(initial_statistics, (spec.obs_dim, 1, 1, len(self.reward_memory), belief)))
+        scales = Scales(*map(initial_statistics, (spec.obs_dim, 1, belief)), Usual(*jnp.zeros(3)))
         return State(
             model,
             controller,
@@ -217,10 +215,11 @@ class PredictiveSACAgent(ControllerAgent):
         return jnp.concatenate([obs, step.prev_action, reward], axis=-1)
 
     def model_input(
-        self, scales: Scales, x: Float[Array, "*batch x"], averages: Float[Array, "*batch averages"]
+        self, scales: Scales, x: Float[Array, "*batch x"], rewards: Float[Array, "*batch constants"]
     ) -> Float[Array, "*batch input"]:
-        """[x_t, m_t], m_t standardised."""
-        return jnp.concatenate([x, standardise(scales.averages, averages)], axis=-1)
+        """[x_t, m_t / σ_r], the second clipped as standardised inputs are."""
+        scale = scales.reward._replace(mean=jnp.zeros(1))
+        return jnp.concatenate([x, standardise(scale, rewards)], axis=-1)
 
     def reset(self, spec: Spec) -> Memory:
         empty = LSTMState(jnp.zeros(self.d_size), jnp.zeros(self.d_size))
@@ -229,32 +228,32 @@ class PredictiveSACAgent(ControllerAgent):
     def act(
         self, state: State, memory: Memory, step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]
     ) -> tuple[Float[Array, " action"], Memory]:
-        x = self.perception(state.scales, step)
-        deviation = jnp.where(step.is_first, 0.0, step.reward - state.scales.usual.mean[0])
-        averages = average_rewards(memory.averages, deviation, self.reward_memory)
-        lstm = state.model.next_state(memory.lstm, self.model_input(state.scales, x, averages), step.is_first)
-        belief = standardise(state.scales.belief, jnp.concatenate([lstm.d, x]))
-        return self.choose(state.controller, belief, key, explore), Memory(lstm, averages)
+        scales = state.scales
+        x = self.perception(scales, step)
+        excess = jnp.where(step.is_first, 0.0, scales.usual.excess(step.reward))
+        rewards = remember(memory.rewards, excess, self.reward_memory)
+        lstm = state.model.next_state(memory.lstm, self.model_input(scales, x, rewards), step.is_first)
+        belief = standardise(scales.belief, jnp.concatenate([lstm.d, x]))
+        return self.choose(state.controller, belief, key, explore), Memory(lstm, rewards)
 
-    def note(self, memory: Memory) -> Float[Array, " averages"]:
+    def note(self, memory: Memory) -> Float[Array, " constants"]:
         """m_t."""
-        return memory.averages
+        return memory.rewards
 
     # Learning the model
 
     def pretrain(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Metrics]:
         state, _, metrics = self.learn_model(state, windows)
-        return state, metrics
+        step = windows.step
+        usual = state.scales.usual.include(step.reward, windows.exists & ~step.is_first)
+        return state._replace(scales=state.scales._replace(usual=usual)), metrics
 
     def learn_model(self, state: State, windows: Window) -> tuple[State, Float[Array, "kept batch belief"], Metrics]:
         """One Adam step on J_model; also returns the beliefs after the burn-in, formed before the step."""
         scales, step = state.scales, windows.step
         obs = update_statistics(scales.obs, step.obs, windows.exists)
-        rewarded = windows.exists & ~step.is_first
-        reward = update_statistics(scales.reward, step.reward[..., None], rewarded)
-        usual = update_statistics(scales.usual, valid_median(step.reward, rewarded)[None], jnp.any(rewarded))
-        averages = update_statistics(scales.averages, windows.note, windows.exists)
-        scales = scales._replace(obs=obs, reward=reward, usual=usual, averages=averages)
+        reward = update_statistics(scales.reward, step.reward[..., None], windows.exists & ~step.is_first)
+        scales = scales._replace(obs=obs, reward=reward)
         x = self.perception(scales, step)
         inputs = self.model_input(scales, x, windows.note)
 

@@ -240,11 +240,6 @@ def update_statistics(
     return RunningStatistics(mean, variance, batches)
 
 
-def valid_median(x: Float[Array, "*batch"], valid: Bool[Array, "*batch"]) -> Float[Array, ""]:
-    """The median of the valid numbers; 0 where none is valid."""
-    return jnp.nan_to_num(jnp.nanmedian(jnp.where(valid, x, jnp.nan)))
-
-
 def standardise(statistics: RunningStatistics | None, x: Float[Array, "*batch size"]) -> Float[Array, "*batch size"]:
     """x with mean 0 and standard deviation 1, clipped to [-10, 10]; x itself if `statistics` is None."""
     if statistics is None:

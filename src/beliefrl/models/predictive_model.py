@@ -1,21 +1,26 @@
 """A recurrent model that learns only to predict; its state is the belief of `predictive-sac`.
 
-With x_t = (o_t, a_{t-1}, r_{t-1}), observations and rewards in standardised units, and m_t, which has an average of the
-past rewards for each time constant T:
+With x_t = (o_t, a_{t-1}, r_{t-1}), observations and rewards in standardised units, and a memory m_t of unusual rewards
+with one entry for each time constant T:
 
-    m_t                  = m_{t-1} + (r_{t-1} - r̄ - m_{t-1}) / T,  zero at the first timestep of an episode
-    h_t                  = LSTM(h_{t-1}; [x_t, m_t])
+    m_t                  = (1 - 1/T) m_{t-1} + u(r_{t-1}),  zero at the first timestep of an episode
+    u(r)                 = r - r̄ where |r - r̄| > 5 δ,  0 elsewhere
+    h_t                  = LSTM(h_{t-1}; [x_t, m_t / σ_r])
     prediction           = MLP[h_t, a_t]
     J_model              = E ‖prediction - (o_{t+1}, r_t)‖²,  mean over the entries
 
 To predict, h_t must contain the information of the history about the hidden state. Some cells start with a long
 memory: the biases of their forget gates are log U(1, T), so that they forget over up to T steps (Tallec and Ollivier
 2018, "chrono initialisation"). An LSTM with the usual initialisation forgets an event within some tens of steps.
-Predictions one step ahead do not train it to remember longer. The averages m_t remember rewards without learning. The
-replay stores them. So a window that begins in the middle of an episode has the memory of the whole episode. r̄ is the
-usual reward, the running median. Without it, m_t would tell the time where all rewards are alike. The value of a state
-would then seem to depend on the time.
+Predictions one step ahead do not train it to remember longer.
+
+The memory m_t needs no learning. The replay stores it, so a window that begins in the middle of an episode has the
+memory of the whole episode. r̄ and δ are the median and the mean absolute deviation of the rewards of the exploration.
+They do not change afterwards, so all of the replay has the same memory. Usual rewards stay out of m_t: where all
+rewards are alike m_t would tell the time, and where they vary all the time it would tell one episode from another.
 """
+
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -25,6 +30,8 @@ from jaxtyping import Array, Bool, Float, Key
 from beliefrl.models.nets import LSTM, MLP, LSTMState, draw
 from beliefrl.models.soft_actor_critic import valid_mean
 
+UNUSUAL = 5  # mean absolute deviations from the median at which a reward is unusual
+
 
 class PredictiveModel(eqx.Module):
     """The weights of an LSTM and of the perceptron that predicts from its state."""
@@ -32,15 +39,15 @@ class PredictiveModel(eqx.Module):
     lstm: LSTM
     predictor: MLP
 
-    def __init__(self, obs: int, action: int, averages: int, d: int, hidden: int):
+    def __init__(self, obs: int, action: int, memories: int, d: int, hidden: int):
         """Sizes of o_t, a_t, m_t, the state of the LSTM, and the hidden layer of the predictor."""
-        self.lstm = LSTM(obs + action + 1 + averages, d)
+        self.lstm = LSTM(obs + action + 1 + memories, d)
         self.predictor = MLP((d + action, hidden, obs + 1), jax.nn.relu)
 
     def unroll(
         self, x: Float[Array, "time batch input"], is_first: Bool[Array, "time batch"], burn_in: int
     ) -> Float[Array, "kept batch d"]:
-        """h_t after the burn-in, given [x_t, m_t]. The burn-in starts with an empty state and gets no gradient."""
+        """h_t after the burn-in, for inputs [x_t, m_t / σ_r]. The burn-in starts from zero and gets no gradient."""
         start = self.lstm.start(x.shape[1])
         if burn_in:
             burnt_in = jax.lax.stop_gradient(self.lstm).unroll(start, x[:burn_in], is_first[:burn_in])
@@ -48,7 +55,7 @@ class PredictiveModel(eqx.Module):
         return self.lstm.unroll(start, x[burn_in:], is_first[burn_in:]).d
 
     def next_state(self, state: LSTMState, x: Float[Array, " input"], is_first: Bool[Array, ""]) -> LSTMState:
-        """The LSTM's state after [x_t, m_t]."""
+        """The LSTM's state after [x_t, m_t / σ_r]."""
         start = jax.tree.map(lambda leaf: leaf[None], state)
         after = self.lstm.unroll(start, x[None, None], is_first[None, None])
         return jax.tree.map(lambda leaf: leaf[0, 0], after)
@@ -58,18 +65,41 @@ class PredictiveModel(eqx.Module):
         return self.predictor(jnp.concatenate([d, action]))
 
 
-def average_rewards(
-    before: Float[Array, " averages"], deviation: Float[Array, ""], constants: tuple[float, ...]
-) -> Float[Array, " averages"]:
-    """m_t, given m_{t-1}, r_{t-1} - r̄ and the time constants in steps."""
-    return before + (deviation - before) / jnp.array(constants)
+class Usual(NamedTuple):
+    """Which rewards are usual: averages over the batches of the pre-training."""
+
+    reward: Float[Array, ""]  # r̄, the median of a batch
+    deviation: Float[Array, ""]  # δ, the mean distance to it
+    batches: Float[Array, ""]  # so far; without any, all rewards are usual
+
+    def include(self, reward: Float[Array, "*batch"], valid: Bool[Array, "*batch"]) -> "Usual":
+        """With the valid rewards of one more batch."""
+        batches = self.batches + jnp.any(valid)
+        rate = jnp.any(valid) / jnp.maximum(batches, 1)
+        median = jnp.nan_to_num(jnp.nanmedian(jnp.where(valid, reward, jnp.nan)))
+        deviation = valid_mean(jnp.abs(reward - median).ravel(), valid.ravel())
+        usual = self.reward + rate * (median - self.reward), self.deviation + rate * (deviation - self.deviation)
+        return Usual(*usual, batches)
+
+    def excess(self, reward: Float[Array, ""]) -> Float[Array, ""]:
+        """u(r)."""
+        difference = reward - self.reward
+        is_unusual = (self.batches > 0) & (jnp.abs(difference) > UNUSUAL * self.deviation)
+        return jnp.where(is_unusual, difference, 0.0)
+
+
+def remember(
+    before: Float[Array, " constants"], excess: Float[Array, ""], constants: tuple[float, ...]
+) -> Float[Array, " constants"]:
+    """m_t, given m_{t-1}, u(r_{t-1}) and the time constants in steps."""
+    return (1 - 1 / jnp.array(constants)) * before + excess
 
 
 def init_model(
     key: Key[Array, ""],
     obs: int,
     action: int,
-    averages: int,
+    memories: int,
     d: int,
     hidden: int,
     long_memories: float,
@@ -77,7 +107,7 @@ def init_model(
 ) -> PredictiveModel:
     """A new model. A fraction `long_memories` of its cells forgets over 1 to `longest_memory` steps."""
     key_weights, key_memories = jax.random.split(key)
-    model = draw(key_weights, PredictiveModel(obs, action, averages, d, hidden))
+    model = draw(key_weights, PredictiveModel(obs, action, memories, d, hidden))
     cells = round(long_memories * d)
     steps = jax.random.uniform(key_memories, (cells,), minval=1.0, maxval=float(longest_memory))
     bias = model.lstm.bias.at[d : d + cells].set(jnp.log(steps))  # gates i, f, g, o

@@ -78,7 +78,7 @@ def _fitting(source: Run, saved: dict[str, np.ndarray], agent: Agent, spec: Spec
         UserError: they do not fit `agent` on its task; it names the first array that differs.
     """
     state = jax.eval_shape(lambda key: agent.init(key, spec), jax.random.key(0))
-    wanted, known = arrays.shapes(agent.networks(state)), arrays.shapes(state)
+    wanted, known = arrays.shapes(jax.eval_shape(agent.networks, state)), arrays.shapes(state)
     for name in wanted.keys() - known.keys():
         raise UserError(f"init_from is impossible: networks() of this agent adds {name.lstrip('.')} to its state.")
     for name in [*wanted, *(name for name in saved if name not in known)]:
