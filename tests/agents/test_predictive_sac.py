@@ -10,7 +10,7 @@ import pytest
 from beliefrl.agents.predictive_sac import PredictiveSACAgent
 from beliefrl.models.nets import standardise
 from beliefrl.models.pool import draw
-from beliefrl.models.predictive_model import average_rewards, init_model, prediction_loss
+from beliefrl.models.predictive_model import Usual, init_model, prediction_loss, remember
 from beliefrl.types import UserError
 from inputs import SPEC, changed_where_missing, same, windows
 
@@ -29,15 +29,20 @@ AGENT = PredictiveSACAgent(
 TIME, COUNT = 11, 12  # timesteps of a window, transitions of a cycle
 
 
-def noted(window, mean=0.0):
-    """The window with the notes of an actor that began with an empty memory; `mean` is r̄."""
+def noted(window, excess=lambda reward: reward):
+    """The window with the notes of an actor that began with an empty memory; `excess` is u."""
     before, notes = jnp.zeros((window.step.reward.shape[1], 2)), []
     for t in range(len(window.step.reward)):
-        deviation = jnp.where(window.step.is_first[t], 0.0, window.step.reward[t] - mean)[:, None]
+        u = jnp.where(window.step.is_first[t], 0.0, excess(window.step.reward[t]))[:, None]
         before = jnp.where(window.step.is_first[t][:, None], 0.0, before)
-        before = before + (deviation - before) / jnp.array([[2.0, 10.0]])
+        before = before * (1 - 1 / jnp.array([[2.0, 10.0]])) + u
         notes.append(before)
     return window._replace(note=jnp.stack(notes))
+
+
+def usual(state, reward, deviation):
+    """The state after a pre-training on rewards with this median and this mean deviation."""
+    return state._replace(scales=state.scales._replace(usual=Usual(*map(jnp.array, (reward, deviation, 1.0)))))
 
 
 @pytest.fixture(scope="module")
@@ -54,9 +59,9 @@ def begun(state):
 
 def test_acting_forms_the_belief_that_replay_forms(state):
     first = jnp.zeros((1, TIME), bool).at[0, jnp.array([0, 5])].set(True)
-    usual = state.scales.usual._replace(mean=jnp.array([0.3]))
-    state = state._replace(scales=state.scales._replace(usual=usual))
-    window = noted(windows(jax.random.key(1), 1, TIME, first), mean=0.3)
+    state = usual(state, 0.3, 0.1)
+    window = windows(jax.random.key(1), 1, TIME, first)
+    window = noted(window, lambda r: jnp.where(jnp.abs(r - 0.3) > 0.5, r - 0.3, 0.0))
     step = window.step
     inputs = AGENT.model_input(state.scales, AGENT.perception(state.scales, step), window.note)
     at_once = jax.jit(lambda: state.model.unroll(inputs, step.is_first, 4))()
@@ -81,28 +86,34 @@ def test_a_belief_in_the_replay_remembers_rewards_from_before_its_window(state):
 
 
 def test_equal_rewards_tell_no_time(state):
-    """Where all rewards are alike, the averages stay at zero, as on CartPole."""
-    usual = state.scales.usual._replace(mean=jnp.ones(1))
-    state = state._replace(scales=state.scales._replace(usual=usual))
-    step, memory = jax.tree.map(lambda leaf: leaf[0, 0], windows(jax.random.key(1), 1, TIME).step), AGENT.reset(SPEC)
-    for t in range(3):
-        now = step._replace(is_first=jnp.array(t == 0), reward=jnp.array(float(t > 0)))
-        _, memory = jax.jit(AGENT.act)(state, memory, now, jax.random.key(t), jnp.array(False))
-    np.testing.assert_array_equal(memory.averages, 0.0)
+    """Where all rewards are alike, as on CartPole, the memory stays empty; so it does before the pre-training."""
+    step = jax.tree.map(lambda leaf: leaf[0, 0], windows(jax.random.key(1), 1, TIME).step)
+    for trained in (state, usual(state, 1.0, 0.0)):
+        memory = AGENT.reset(SPEC)
+        for t in range(3):
+            now = step._replace(is_first=jnp.array(t == 0), reward=jnp.array(float(t > 0)))
+            _, memory = jax.jit(AGENT.act)(trained, memory, now, jax.random.key(t), jnp.array(False))
+        np.testing.assert_array_equal(memory.rewards, 0.0)
 
 
-def test_the_usual_reward_is_the_median_and_rare_rewards_do_not_change_it(state):
+def test_pretraining_learns_which_rewards_are_usual_and_what_follows_does_not_change_it(state):
+    rewards = jnp.ones((TIME, 2)).at[3, 0].set(9.0).at[5, 1].set(3.0).at[0].set(-70.0)  # the last are no rewards
     window = noted(windows(jax.random.key(1), 2, TIME))
-    rewards = jnp.ones((TIME, 2)).at[3, 0].set(1000.0).at[0].set(-7.0)  # a reward before a first timestep is none
     window = window._replace(step=window.step._replace(reward=rewards))
-    np.testing.assert_allclose(jax.jit(AGENT.learn_model)(state, window)[0].scales.usual.mean, [1.0])
+    trained, _ = jax.jit(AGENT.pretrain)(state, window, jax.random.key(2))
+    np.testing.assert_allclose(trained.scales.usual, (1.0, 10 / 20, 1.0), rtol=1e-6)
+    np.testing.assert_allclose(trained.scales.usual.excess(jnp.array(3.5)), 0.0)  # five deviations
+    np.testing.assert_allclose(trained.scales.usual.excess(jnp.array(3.6)), 2.6)
+    np.testing.assert_allclose(trained.scales.usual.excess(jnp.array(-3.0)), -4.0)
+    later, _, _ = jax.jit(AGENT.begin_cycle)(trained, window, jax.random.key(3))
+    assert same(later.scales.usual, trained.scales.usual)
 
 
-def test_the_averages_of_rewards_are_exponential():
-    averages = jnp.zeros(2)
-    for reward in (1.0, 0.0, 3.0):
-        averages = average_rewards(averages, jnp.array(reward), (2.0, 10.0))
-    np.testing.assert_allclose(averages, [1 / 8 + 3 / 2, 0.1 * 0.9**2 + 0.3], rtol=1e-6)
+def test_the_memory_of_rewards_decays():
+    memory = jnp.zeros(2)
+    for excess in (1.0, 0.0, 3.0):
+        memory = remember(memory, jnp.array(excess), (2.0, 10.0))
+    np.testing.assert_allclose(memory, [0.25 + 3, 0.9**2 + 3], rtol=1e-6)
 
 
 def test_transitions_in_the_pool_are_aligned_in_time(state, begun):
