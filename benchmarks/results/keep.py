@@ -14,7 +14,6 @@ own. It plays 100 further episodes; their returns and those of all seeds are in 
 
 import json
 import pathlib
-import shutil
 import sys
 import tempfile
 import zipfile
@@ -56,7 +55,10 @@ def pack(run: beliefrl.Run, folder: pathlib.Path) -> pathlib.Path:
     networks = arrays.load(run.folder / "agent.safetensors")
     (folder / "agent.safetensors").write_bytes(arrays.packed({name: array[[best]] for name, array in networks.items()}))
     (folder / "metrics").mkdir()
-    shutil.copy(run.folder / "metrics" / f"seed-{seed}.jsonl", folder / "metrics")
+    with (folder / "metrics" / f"seed-{seed}.jsonl").open("w") as log:  # six significant digits, as in files of results
+        for row in run.rows(seed):
+            rounded = json.loads(json.dumps(row), parse_float=lambda number: float(f"{float(number):.6g}"))
+            log.write(json.dumps(rounded) + "\n")
     again = beliefrl.evaluate(folder, EPISODES, seed=1)
     write("results.json", {"step": run.results()["step"], **again, "chosen_from": {"seeds": run.seeds, **evaluated}})
     path = FOLDER / f"{run.config['task']}.zip"

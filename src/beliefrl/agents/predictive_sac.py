@@ -181,7 +181,8 @@ class PredictiveSACAgent(ControllerAgent):
         belief = self.d_size + spec.obs_dim + spec.action_dim + 1
         layers = self.policy_layers, self.value_layers
         controller = double_q.init_controller(key_controller, belief, spec.action_dim, *layers, self.alpha_start)
-        scales = Scales(*map(initial_statistics, (spec.obs_dim, 1, belief)), Usual(*jnp.zeros(3)))
+        obs_scale, reward_scale, belief_scale = map(initial_statistics, (spec.obs_dim, 1, belief))
+        scales = Scales(obs_scale, reward_scale, belief_scale, Usual(*jnp.zeros(3)))
         return State(
             model,
             controller,
