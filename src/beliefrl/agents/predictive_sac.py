@@ -13,9 +13,9 @@ One unroll of the windows of a cycle serves both: the model learns from it, and 
 has the transitions of the last `pool` cycles, and the controller's batches are drawn from it. The windows of one cycle
 are too few and too correlated for a batch.
 
-In training the newest weights act. Evaluations and the trained agent have an average of the last weights of the model
-and of the actor (Polyak and Juditsky 1992). One update can make a policy lose what it had learned, and the average does
-not follow a single update.
+In training the newest weights act. Evaluations and the trained agent use an average of the last weights of the model
+and of the actor (`models.average`). The policy of the newest weights can change within few updates. The average changes
+slowly.
 """
 
 import dataclasses
@@ -128,8 +128,8 @@ class PredictiveSACAgent(ControllerAgent):
     pool: int = 8
     """Number of the last cycles whose transitions are in the pool."""
     average_rate: float = 2e-3
-    """Rate at which the evaluated agent, an average of the last weights, follows them at each update, in (0, 1]. 1: the
-    newest weights are evaluated."""
+    """Rate of the running average of the weights that is evaluated and saved, in (0, 1]. With 1, the newest weights are
+    evaluated."""
 
     ranges = ControllerAgent.ranges | {
         "batch_size": (64, 128, 256, 512),

@@ -1,4 +1,4 @@
-"""A running average of weights, which does not follow a single update (Polyak and Juditsky 1992).
+"""A running average of weights, which changes more slowly than the weights (Polyak and Juditsky 1992).
 
     w̄ = w̄ + ρ (w - w̄),   ρ = max(rate, 1 / number of the update)
 
@@ -22,7 +22,7 @@ class Average(NamedTuple):
 
 
 def begin(weights: Any) -> Average:
-    """An average without updates, for weights of these shapes."""
+    """An average before the first update, for weights of these shapes."""
     return Average(jax.tree.map(jnp.copy, weights), jnp.zeros((), int))
 
 

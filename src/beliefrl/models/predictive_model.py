@@ -16,8 +16,8 @@ Predictions one step ahead do not train it to remember longer.
 
 The memory m_t needs no learning. The replay stores it, so a window that begins in the middle of an episode has the
 memory of the whole episode. r̄ and δ are the median and the mean absolute deviation of the rewards of the exploration.
-They do not change afterwards, so all of the replay has the same memory. Usual rewards stay out of m_t: where all
-rewards are alike m_t would tell the time, and where they vary all the time it would tell one episode from another.
+They do not change afterwards, so m_t has one meaning in the whole replay. m_t has no usual rewards, for two reasons. If
+all rewards are equal, m_t would only tell the time. If they vary at every step, m_t might only identify the episode.
 """
 
 from typing import NamedTuple
@@ -66,7 +66,7 @@ class PredictiveModel(eqx.Module):
 
 
 class Usual(NamedTuple):
-    """Which rewards are usual: averages over the batches of the pre-training."""
+    """Which rewards are usual; both numbers are averages over the batches of the pre-training."""
 
     reward: Float[Array, ""]  # r̄, the median of a batch
     deviation: Float[Array, ""]  # δ, the mean distance to it
