@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from beliefrl.agents.predictive_sac import PredictiveSACAgent
+from beliefrl.agents.predictive_sac import Note, PredictiveSACAgent
+from beliefrl.models.double_q import Policy
 from beliefrl.models.nets import standardise
 from beliefrl.models.pool import draw
 from beliefrl.models.predictive_model import Usual, init_model, prediction_loss, remember
@@ -30,14 +31,18 @@ TIME, COUNT = 11, 12  # timesteps of a window, transitions of a cycle
 
 
 def noted(window, excess=lambda reward: reward):
-    """The window with the notes of an actor that began with an empty memory; `excess` is u."""
+    """The window with the notes of an actor that began with an empty memory; `excess` is u.
+
+    The policy that acted is a standard normal before the tanh.
+    """
     before, notes = jnp.zeros((window.step.reward.shape[1], 2)), []
     for t in range(len(window.step.reward)):
         u = jnp.where(window.step.is_first[t], 0.0, excess(window.step.reward[t]))[:, None]
         before = jnp.where(window.step.is_first[t][:, None], 0.0, before)
         before = before * (1 - 1 / jnp.array([[2.0, 10.0]])) + u
         notes.append(before)
-    return window._replace(note=jnp.stack(notes))
+    zeros = jnp.zeros_like(window.step.prev_action)
+    return window._replace(note=Note(jnp.stack(notes), Policy(zeros, zeros)))
 
 
 def usual(state, reward, deviation):
@@ -63,21 +68,22 @@ def test_acting_forms_the_belief_that_replay_forms(state):
     window = windows(jax.random.key(1), 1, TIME, first)
     window = noted(window, lambda r: jnp.where(jnp.abs(r - 0.3) > 0.5, r - 0.3, 0.0))
     step = window.step
-    inputs = AGENT.model_input(state.scales, AGENT.perception(state.scales, step), window.note)
+    inputs = state.scales.model_input(state.scales.perception(step), window.note.rewards)
     at_once = jax.jit(lambda: state.model.unroll(inputs, step.is_first, 4))()
     memory, act = AGENT.reset(SPEC), jax.jit(AGENT.act)
     for t in range(TIME):
         now = jax.tree.map(lambda leaf, t=t: leaf[t, 0], step)
         memory = AGENT.reset(SPEC) if now.is_first else memory
         _, memory = act(state, memory, now, jax.random.key(t), jnp.array(False))
-        np.testing.assert_allclose(AGENT.note(memory), window.note[t, 0], rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(AGENT.note(memory).rewards, window.note.rewards[t, 0], rtol=1e-5, atol=1e-6)
         if t >= 4:
             np.testing.assert_allclose(memory.lstm.d, at_once[t - 4, 0], rtol=1e-5, atol=1e-6)
 
 
 def test_a_belief_in_the_replay_remembers_rewards_from_before_its_window(state):
     window = noted(windows(jax.random.key(1), 2, TIME))
-    long_ago = window._replace(note=window.note.at[:, 0].add(1.0))  # a reward before the window
+    rewards = window.note.rewards.at[:, 0].add(1.0)  # a reward before the window
+    long_ago = window._replace(note=window.note._replace(rewards=rewards))
     learn = jax.jit(AGENT.learn_model)
     plain, other = learn(state, window)[1], learn(state, long_ago)[1]
     d = AGENT.d_size
@@ -116,36 +122,62 @@ def test_the_memory_of_rewards_decays():
     np.testing.assert_allclose(memory, [0.25 + 3, 0.9**2 + 3], rtol=1e-6)
 
 
+def test_an_actor_notes_the_policy_that_chose_its_action(state):
+    """Of a sampled action, the note's policy is the one at its own belief; the mode is its mean."""
+    step = jax.tree.map(lambda leaf: leaf[0, 0], windows(jax.random.key(1), 1, TIME).step)
+    mode, memory = jax.jit(AGENT.act)(state, AGENT.reset(SPEC), step, jax.random.key(0), jnp.array(False))
+    belief = jnp.concatenate([memory.lstm.d, state.scales.perception(step)])
+    policy = AGENT.note(memory).policy
+    expected = state.controller.actor(standardise(state.scales.belief, belief))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), policy, expected)
+    np.testing.assert_allclose(mode, jnp.tanh(policy.mean), rtol=1e-5)
+    _, sampled = jax.jit(AGENT.act)(state, AGENT.reset(SPEC), step, jax.random.key(0), jnp.array(True))
+    assert same(sampled.policy, policy)
+
+
 def test_transitions_in_the_pool_are_aligned_in_time(state, begun):
     after, _, window = begun
     pool, step = jax.tree.map(lambda leaf: leaf[0], after.pool.transitions), window.step
-    x = AGENT.perception(after.scales, step)  # the scales of this cycle, the model before its update
-    inputs = AGENT.model_input(after.scales, x, window.note)
+    x = after.scales.perception(step)  # the scales of this cycle, the model before its update
+    inputs = after.scales.model_input(x, window.note.rewards)
     belief = jnp.concatenate([state.model.unroll(inputs, step.is_first, 4), x[4:]], axis=-1)
     for t, sequence in ((0, 0), (2, 1), (5, 1)):
-        row, now, m = 2 * t + sequence, 4 + t, min(AGENT.n_step, 6 - t)
+        row, now = 2 * t + sequence, 4 + t
         np.testing.assert_allclose(pool.belief[row], belief[t, sequence], rtol=1e-4, atol=1e-5)
-        np.testing.assert_allclose(pool.next_belief[row], belief[t + m, sequence], rtol=1e-4, atol=1e-5)
         np.testing.assert_array_equal(pool.action[row], step.prev_action[now + 1, sequence])
-        rewards = [0.995**k * float(step.reward[now + 1 + k, sequence]) for k in range(m)]
-        np.testing.assert_allclose(pool.reward[row], sum(rewards), rtol=1e-4, atol=1e-5)
-        np.testing.assert_allclose(pool.discount[row], 0.995**m, rtol=1e-5)
+
+
+def test_targets_in_the_pool_are_those_of_the_window(state, begun):
+    """With λ = 0 a target is the next reward and value; with λ = 1 and ω = 1 it has all rewards of the window."""
+    _, _, window = begun
+    step = jax.tree.map(lambda leaf: leaf[4:], window.step)
+    for decay in (0.0, 1.0):
+        agent = dataclasses.replace(AGENT, trace_decay=decay, off_policy_trace=1.0)
+        zero = jax.tree.map(jnp.zeros_like, state.controller.targets)  # V̄ = 0
+        valueless = state._replace(controller=state.controller._replace(targets=zero))
+        after, _, _ = jax.jit(agent.begin_cycle)(valueless, window, jax.random.key(2))
+        y = np.asarray(after.pool.transitions.target[0]).reshape(6, 2)
+        expected = np.zeros(2)
+        for t in reversed(range(6)):
+            expected = np.asarray(step.reward[t + 1]) + 0.995 * decay * expected * ~np.asarray(step.terminated[t + 1])
+            np.testing.assert_allclose(y[t], expected, rtol=1e-4, atol=1e-5)
+            expected = np.where(step.is_first[t], 0.0, expected)
 
 
 def test_a_batch_is_standardised_and_drawn_from_all_cycles_in_the_pool(state, begun):
     after, batches, _ = begun
-    assert batches.reward.shape == (1, 16)
-    raw = draw(after.pool, jax.random.key(2), (1, 16))
+    assert batches.target.shape == (1, 16)
+    raw = draw(after.pool, jax.random.split(jax.random.key(2))[1], (1, 16))
     np.testing.assert_allclose(batches.belief, standardise(after.scales.belief, raw.belief), rtol=1e-5, atol=1e-6)
 
     begin, seen = jax.jit(AGENT.begin_cycle), after
     for number in range(4):  # the pool has room for three cycles
         seen, _, _ = begin(seen, noted(windows(jax.random.key(10 + number), 2, TIME)), jax.random.key(number))
         cycles = min(number + 2, 3)
-        stored = set(np.asarray(seen.pool.transitions.reward)[:cycles].ravel().tolist())
-        drawn = set(np.asarray(draw(seen.pool, jax.random.key(3), (8, 64)).reward).ravel().tolist())
+        stored = set(np.asarray(seen.pool.transitions.target)[:cycles].ravel().tolist())
+        drawn = set(np.asarray(draw(seen.pool, jax.random.key(3), (8, 64)).target).ravel().tolist())
         assert drawn == stored
-    assert not set(np.asarray(after.pool.transitions.reward[0]).tolist()) & stored  # the first cycle was replaced
+    assert not set(np.asarray(after.pool.transitions.target[0]).tolist()) & stored  # the first cycle was replaced
 
 
 def test_the_controller_sends_no_gradient_into_the_model(state, begun):
@@ -210,7 +242,14 @@ def test_what_does_not_exist_changes_nothing(state):
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("pool", 0), ("long_memories", 1.5), ("n_step", 0), ("alpha_start", -1.0), ("average_rate", 0.0)],
+    [
+        ("pool", 0),
+        ("long_memories", 1.5),
+        ("trace_decay", 1.5),
+        ("off_policy_trace", -0.1),
+        ("alpha_start", -1.0),
+        ("average_rate", 0.0),
+    ],
 )
 def test_impossible_values_are_refused(field, value):
     with pytest.raises(UserError, match=f"{field}={value} is impossible"):

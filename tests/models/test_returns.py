@@ -1,4 +1,4 @@
-"""n-step returns: against plain Python, at every kind of end; in the agents; what they are for."""
+"""n-step and λ-returns: against plain Python, at every kind of end; in the agents; what they are for."""
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beliefrl import agents
-from beliefrl.models.returns import n_step_returns, transition_batch
+from beliefrl.models.returns import lambda_returns, n_step_returns, transition_batch
 from beliefrl.types import Timestep
 from inputs import SMALL, SPEC, windows
 
@@ -53,6 +53,36 @@ def test_returns_are_those_of_walking_along_the_episode(window, n):
         assert bool(returns.terminated[first, 0]) == terminal
         np.testing.assert_allclose(returns.reward[first, 0], total, rtol=1e-5, atol=1e-5)
         np.testing.assert_allclose(returns.discount[first, 0], discount, rtol=1e-6)
+
+
+def plain_lambda_return(rewards, firsts, terminated, values, traces, first):
+    """The λ-return that begins at one timestep, by walking."""
+    if terminated[first + 1]:
+        return rewards[first + 1]
+    follows = first + 2 < len(rewards) and not firsts[first + 2]
+    trace = traces[first + 1] if follows else 0.0
+    ahead = (1 - trace) * values[first + 1]
+    if follows:
+        ahead += trace * plain_lambda_return(rewards, firsts, terminated, values, traces, first + 1)
+    return rewards[first + 1] + GAMMA * ahead
+
+
+jitted_lambda_returns = jax.jit(lambda_returns, static_argnums=4)
+
+
+@settings(deadline=None, max_examples=40)
+@given(timesteps, st.integers(0, 1000))
+def test_lambda_returns_are_those_of_walking_along_the_episode(window, seed):
+    rewards, firsts, ends = window
+    terminated = [end and i + 1 < len(firsts) and firsts[i + 1] for i, end in enumerate(ends)]
+    step, rng = step_of(rewards, firsts, terminated), np.random.default_rng(seed)
+    values, traces = rng.normal(size=len(rewards)), rng.uniform(size=len(rewards))
+    valid = ~step.is_first[1:]
+    given = np.float32(values)[:, None], np.float32(traces)[:-1, None]
+    y = np.asarray(jitted_lambda_returns(step, valid, *given, GAMMA))
+    for first in np.flatnonzero(valid[:, 0]):
+        expected = plain_lambda_return(rewards, firsts, terminated, values, traces, first)
+        np.testing.assert_allclose(y[first, 0], expected, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,10 @@ import pytest
 
 from beliefrl.models import double_q
 from beliefrl.models import soft_actor_critic as sac
-from beliefrl.models.double_q import Unit, init_optimisers
+from beliefrl.models.double_q import Policy, Samples, Unit, init_optimisers
 from beliefrl.models.nets import tanh_gaussian
 from beliefrl.models.soft_actor_critic import Actor, Batch, Optimisers
+from beliefrl.types import Timestep
 
 BELIEF, ACTION, ROWS = 5, 2, 6
 RATES = {"actor": 0.25, "critic": 0.5, "alpha": 0.125}
@@ -178,14 +179,11 @@ def make(key=KEY):
 
 
 def random_batch(key=KEY):
-    keys = jax.random.split(key, 6)
-    return Batch(
+    keys = jax.random.split(key, 3)
+    return Samples(
         belief=jax.random.normal(keys[0], (COUNT, BELIEF)),
-        next_belief=jax.random.normal(keys[1], (COUNT, BELIEF)),
-        action=jnp.tanh(jax.random.normal(keys[2], (COUNT, ACTION))),
-        reward=10 * jax.random.normal(keys[3], (COUNT,)),
-        terminated=jnp.arange(COUNT) % 3 == 0,
-        discount=jax.random.uniform(keys[4], (COUNT,)),
+        action=jnp.tanh(jax.random.normal(keys[1], (COUNT, ACTION))),
+        target=10 * jax.random.normal(keys[2], (COUNT,)),
         valid=jnp.arange(COUNT) % 4 != 1,
     )
 
@@ -209,22 +207,55 @@ def policy(actor, belief, noise):
     return np.tanh(u), np.sum(normal - np.log(1 - np.tanh(u) ** 2 + 1e-6), axis=-1), mean
 
 
-def test_targets_are_bootstrapped_from_the_lesser_target_and_hold_no_entropy():
-    controller, data, key = make(), random_batch(), jax.random.key(3)
-    y = jax.jit(double_q.target)(controller, data, key)
-    action, _, _ = policy(controller.actor, data.next_belief, np.asarray(jax.random.normal(key, (COUNT, ACTION))))
-    after = np.minimum(*(q(critic, data.next_belief, action) for critic in controller.targets))
-    expected = data.reward + data.discount * np.where(data.terminated, 0, float(controller.unit.u) * after)
-    np.testing.assert_allclose(y, expected, rtol=1e-4, atol=1e-4)
+def density(policy, action):
+    """The density of the action before the tanh."""
+    before, sigma = np.arctanh(action), np.exp(policy.log_sigma)
+    return np.prod(np.exp(-0.5 * ((before - policy.mean) / sigma) ** 2) / sigma, axis=-1)
+
+
+def test_targets_mix_the_lesser_target_s_values_by_how_likely_the_actions_are():
+    controller, key, time = make(), jax.random.key(3), 4
+    keys = jax.random.split(jax.random.key(5), 5)
+    belief = jax.random.normal(keys[0], (time, 2, BELIEF))
+    action = jnp.tanh(jax.random.normal(keys[1], (time, 2, ACTION)))
+    first, terminated = jnp.zeros((time, 2), bool), jnp.zeros((time, 2), bool).at[-1, 0].set(True)
+    step = Timestep(belief, jax.random.normal(keys[2], (time, 2)), action, first, terminated)
+    behaviour = Policy(*(0.5 * jax.random.normal(key, (time, 2, ACTION)) for key in keys[3:]))
+    valid = jnp.ones((time - 1, 2), bool)
+    made = jax.jit(lambda: double_q.targets(controller, belief, step, valid, behaviour, key, 0.9, 0.8, 0.25))
+    y, like = map(np.asarray, made())
+
+    flat = np.asarray(belief).reshape(-1, BELIEF)
+    noise = np.asarray(jax.random.normal(key, (time * 2, ACTION)))
+    sampled, _, _ = policy(controller.actor, flat, noise)
+    value = 3 * np.minimum(*(q(critic, flat, sampled) for critic in controller.targets)).reshape(time, 2)  # u = 3
+    now = Policy(*np.split(dense(controller.actor.network, np.asarray(belief)), 2, axis=-1))
+    ahead = value[-1]
+    for t in reversed(range(time - 1)):
+        taken, before = np.asarray(action[t + 1]), jax.tree.map(lambda leaf, t=t: np.asarray(leaf[t]), (now, behaviour))
+        expected = np.minimum(1, density(before[0], taken) / density(before[1], taken))
+        np.testing.assert_allclose(like[t], expected, rtol=1e-3)
+        expected_y = np.asarray(step.reward[t + 1]) + 0.9 * np.where(step.terminated[t + 1], 0, ahead)
+        np.testing.assert_allclose(y[t], expected_y, rtol=1e-3, atol=1e-4)
+        trace = 0.8 * (0.25 + 0.75 * expected)
+        ahead = (1 - trace) * value[t] + trace * expected_y
+    assert (like < 1).any()
+    assert (like == 1).any()
+
+
+def test_an_action_at_the_bound_has_a_finite_likeness():
+    narrow, wide = (Policy(jnp.zeros(2), jnp.full(2, log_sigma)) for log_sigma in (-20.0, 2.0))
+    action = jnp.array([1.0, -1.0])
+    for policy, behaviour, expected in ((wide, wide, 1.0), (narrow, wide, 0.0), (wide, narrow, 1.0)):
+        np.testing.assert_allclose(double_q.likeness(policy, behaviour, action), expected, atol=1e-6)
 
 
 def test_the_losses_are_their_formulas_over_valid_transitions():
     controller, data, key = make(), random_batch(), jax.random.key(3)
     valid, u = np.asarray(data.valid), float(controller.unit.u)
-    y = 10 * jax.random.normal(key, (COUNT,))
-    errors = [q(critic, data.belief, data.action) - np.asarray(y) / u for critic in controller.critics]
+    errors = [q(critic, data.belief, data.action) - np.asarray(data.target) / u for critic in controller.critics]
     expected = np.mean(sum(0.5 * error[valid] ** 2 for error in errors))
-    np.testing.assert_allclose(double_q.q_loss(controller.critics, data, y, controller.unit.u), expected, rtol=1e-4)
+    np.testing.assert_allclose(double_q.q_loss(controller.critics, data, controller.unit.u), expected, rtol=1e-4)
 
     j_pi, (least, log_prob) = jax.jit(double_q.actor_loss, static_argnums=4)(
         controller.actor, controller, data, key, 0.2
@@ -239,7 +270,7 @@ def test_the_losses_are_their_formulas_over_valid_transitions():
 
 def test_a_new_unit_leaves_every_q_as_it_is():
     controller, data = make(), random_batch()
-    after = jax.jit(double_q.rescale)(controller, 100 * data.reward, data.valid)
+    after = jax.jit(double_q.rescale)(controller, 100 * data.target, data.valid)
     assert after.unit.u > 2 * controller.unit.u
     for old, new in zip((*controller.critics, *controller.targets), (*after.critics, *after.targets), strict=True):
         before, now = (q(critic, data.belief, data.action) for critic in (old, new))
@@ -269,7 +300,7 @@ def test_what_is_learned_does_not_depend_on_the_size_of_rewards(size):
 
     plain = make()._replace(unit=Unit(jnp.array(25.0), jnp.array(1e6)))
     scaled = plain._replace(unit=Unit(jnp.array(25.0) * size**2, jnp.array(1e6)))
-    actors = learn(plain, data).actor, learn(scaled, data._replace(reward=size * data.reward)).actor
+    actors = learn(plain, data).actor, learn(scaled, data._replace(target=size * data.target)).actor
     for a, b in zip(*map(jax.tree.leaves, actors), strict=True):
         np.testing.assert_allclose(a, b, atol=2e-3)
 

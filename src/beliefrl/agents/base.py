@@ -32,7 +32,7 @@ Metrics = dict[str, Float[Array, ""]]
 
 @dataclasses.dataclass(frozen=True)
 class ControllerAgent:
-    """Base class of agents whose controller is a soft actor-critic: its hyperparameters, its actions, its batches."""
+    """Base class of agents whose controller is a soft actor-critic: its hyperparameters and its actions."""
 
     gamma: float = 0.99
     """Discount factor γ, in [0, 1] (Table 1)."""
@@ -40,8 +40,6 @@ class ControllerAgent:
     """Environment steps before training starts; the untrained policy acts until then (Table 1)."""
     train_interval_rl: int = 1
     """Environment steps between two updates of the controller (Table 1)."""
-    n_step: int = 1
-    """Steps of the critics' n-step returns (the paper: one). More propagate rewards faster over a long horizon."""
     lr_actor: float = 3e-4
     """Adam's learning rate for the actor (Table 1)."""
     lr_critic: float = 3e-4
@@ -61,7 +59,6 @@ class ControllerAgent:
 
     ranges = {  # for `beliefrl.tune`
         "gamma": Range(0.95, 0.999, "horizon"),
-        "n_step": (1, 3, 5, 10),
         "lr_actor": Range(1e-4, 3e-3, "log"),
         "lr_critic": Range(1e-4, 3e-3, "log"),
         "lr_alpha": Range(1e-4, 3e-3, "log"),
@@ -74,7 +71,6 @@ class ControllerAgent:
         """Refuse impossible values with a UserError."""
         check_range(self, ("train_interval_rl",), 1)
         check_range(self, ("policy_layers", "value_layers"), 1, WIDEST)
-        check_range(self, ("n_step",), 1, MOST_STEPS)
         check_range(self, ("actor_regulariser",), 0)
         check_range(self, ("step_start_rl",), 2)  # fewer timesteps hold no transition
         check_range(self, ("lr_actor", "lr_critic", "lr_alpha", "gamma", "tau"), 0, 1)
@@ -110,6 +106,38 @@ class ControllerAgent:
         noise = jnp.where(explore, jax.random.normal(key, mean.shape), 0.0)
         return tanh_gaussian(mean, log_sigma, noise)[0]
 
+
+@dataclasses.dataclass(frozen=True)
+class SACAgent(ControllerAgent):
+    """Base class of the paper's agents, whose controller has a V (Table 1)."""
+
+    n_step: int = 1
+    """Steps of the critics' n-step returns (the paper: one). More propagate rewards faster over a long horizon."""
+    updates_per_step: int = 1
+    """Updates of the controller every `train_interval_rl` steps (Table 1: one). With more, learning takes fewer steps,
+    and each step takes longer."""
+    value_start: float = 0.0
+    """Initial output of V and Q, up to noise from the initial weights (the paper: 0), in units of the return."""
+
+    ranges = ControllerAgent.ranges | {"n_step": (1, 3, 5, 10), "updates_per_step": (1, 2, 4)}
+
+    def __post_init__(self) -> None:
+        """Refuse impossible values with a UserError."""
+        super().__post_init__()
+        check_range(self, ("n_step",), 1, MOST_STEPS)
+        check_range(self, ("updates_per_step",), 1)
+        check_range(self, ("value_start",), -LARGEST)
+
+    @property
+    def cycle_updates(self) -> int:
+        """Updates of the controller in a cycle."""
+        return self.cycle // self.train_interval_rl * self.updates_per_step
+
+    @property
+    def losses(self) -> tuple[str, ...]:
+        """The metrics that stop a seed if they are not finite."""
+        return "loss_value", "loss_q", "loss_actor"
+
     def transitions(
         self,
         windows: Window,
@@ -129,35 +157,6 @@ class ControllerAgent:
         after = belief if next_belief is None else next_belief
         step, valid = windows.between(burn_in, None).step, transitions(windows, burn_in)
         return transition_batch(step, valid, belief, after, self.n_step, self.gamma, actor_input)
-
-
-@dataclasses.dataclass(frozen=True)
-class SACAgent(ControllerAgent):
-    """Base class of the paper's agents, whose controller has a V (Table 1)."""
-
-    updates_per_step: int = 1
-    """Updates of the controller every `train_interval_rl` steps (Table 1: one). With more, learning takes fewer steps,
-    and each step takes longer."""
-    value_start: float = 0.0
-    """Initial output of V and Q, up to noise from the initial weights (the paper: 0), in units of the return."""
-
-    ranges = ControllerAgent.ranges | {"updates_per_step": (1, 2, 4)}
-
-    def __post_init__(self) -> None:
-        """Refuse impossible values with a UserError."""
-        super().__post_init__()
-        check_range(self, ("updates_per_step",), 1)
-        check_range(self, ("value_start",), -LARGEST)
-
-    @property
-    def cycle_updates(self) -> int:
-        """Updates of the controller in a cycle."""
-        return self.cycle // self.train_interval_rl * self.updates_per_step
-
-    @property
-    def losses(self) -> tuple[str, ...]:
-        """The metrics that stop a seed if they are not finite."""
-        return "loss_value", "loss_q", "loss_actor"
 
     def init_controller(
         self, key: Key[Array, ""], belief: int, action: int, actor_size: int | None = None

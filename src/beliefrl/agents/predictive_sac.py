@@ -29,28 +29,13 @@ from jaxtyping import Array, Bool, Float, Key
 from beliefrl.agents.base import ControllerAgent, Metrics, Range
 from beliefrl.models import average, double_q, pool
 from beliefrl.models.average import Average
-from beliefrl.models.double_q import DoubleQController
-from beliefrl.models.nets import (
-    LSTMState,
-    RunningStatistics,
-    descend,
-    initial_statistics,
-    standardise,
-    update_statistics,
-)
+from beliefrl.models.double_q import DoubleQController, Policy, Samples
+from beliefrl.models.nets import LSTMState, descend, standardise, update_statistics
 from beliefrl.models.pool import Pool
-from beliefrl.models.predictive_model import PredictiveModel, Usual, init_model, prediction_loss, remember
-from beliefrl.models.soft_actor_critic import Batch, OptimiserState
+from beliefrl.models.predictive_model import PredictiveModel, init_model, prediction_loss, remember
+from beliefrl.models.scales import Scales, initial_scales
+from beliefrl.models.soft_actor_critic import OptimiserState, valid_mean
 from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range, transitions
-
-
-class Scales(NamedTuple):
-    """Running statistics, by which inputs are standardised."""
-
-    obs: RunningStatistics
-    reward: RunningStatistics
-    belief: RunningStatistics
-    usual: Usual  # r̄ and δ, from the pre-training
 
 
 class Memory(NamedTuple):
@@ -58,6 +43,14 @@ class Memory(NamedTuple):
 
     lstm: LSTMState
     rewards: Float[Array, "*batch constants"]  # m_t, in units of the reward
+    policy: Policy  # the policy that chose the last action
+
+
+class Note(NamedTuple):
+    """What the replay stores with a timestep."""
+
+    rewards: Float[Array, "*batch constants"]  # m_t
+    policy: Policy  # μ, which chose a_t
 
 
 class State(NamedTuple):
@@ -79,23 +72,25 @@ class PredictiveSACAgent(ControllerAgent):
     # The controller
     gamma: float = 0.995
     """Discount factor γ, in [0, 1]."""
-    n_step: int = 5
-    """Steps of the critics' returns."""
+    trace_decay: float = 0.95
+    """λ of the λ-returns from which the critics learn, in [0, 1]. With 0, they have the reward of one step."""
+    off_policy_trace: float = 0.5
+    """ω, the fraction of λ at actions that the present policy would not choose, in [0, 1]. With 1, λ-returns do not
+    distinguish between the actions of the present and of older policies."""
     train_interval_rl: int = 1
     """Environment steps between two updates of the model. The controller makes one update for each step."""
-    batch_size: int = 256
+    batch_size: int = 128
     """Transitions in an update of the controller."""
     lr_actor: float = 1e-3
     """Adam's learning rate for the actor."""
     lr_critic: float = 1e-3
     """Adam's learning rate for both Q."""
-    lr_alpha: float = 1e-3
+    lr_alpha: float = 2e-3
     """Adam's learning rate for log α, the temperature."""
     alpha_start: float = 0.1
     """α before training, in units of the returns."""
     tau: float = 0.02
-    """Soft-update rate of the target Qs, in [0, 1]. It limits how fast values spread back in time: n_step steps in
-    1/τ updates."""
+    """Soft-update rate of the target Qs, in [0, 1]."""
     policy_layers: tuple[int, ...] = (128, 128)
     """Hidden layers of the actor."""
     value_layers: tuple[int, ...] = (128, 128)
@@ -133,6 +128,7 @@ class PredictiveSACAgent(ControllerAgent):
 
     ranges = ControllerAgent.ranges | {
         "batch_size": (64, 128, 256, 512),
+        "trace_decay": Range(0.8, 1.0),
         "tau": Range(5e-3, 5e-2, "log"),
         "lr_model": Range(1e-4, 3e-3, "log"),
         "seq_len": (16, 32, 64),
@@ -148,7 +144,7 @@ class PredictiveSACAgent(ControllerAgent):
         check_range(self, ("d_size", "hidden_size"), 1, WIDEST)
         check_range(self, ("burn_in", "pretrain_updates"), 0)
         check_range(self, ("alpha_start",), 1e-6)
-        check_range(self, ("lr_model", "long_memories"), 0, 1)
+        check_range(self, ("lr_model", "long_memories", "trace_decay", "off_policy_trace"), 0, 1)
         check_range(self, ("average_rate",), 1e-6, 1)
         check_range(self, ("reward_memory",), 1)
 
@@ -181,12 +177,10 @@ class PredictiveSACAgent(ControllerAgent):
         belief = self.d_size + spec.obs_dim + spec.action_dim + 1
         layers = self.policy_layers, self.value_layers
         controller = double_q.init_controller(key_controller, belief, spec.action_dim, *layers, self.alpha_start)
-        obs_scale, reward_scale, belief_scale = map(initial_statistics, (spec.obs_dim, 1, belief))
-        scales = Scales(obs_scale, reward_scale, belief_scale, Usual(*jnp.zeros(3)))
         return State(
             model,
             controller,
-            scales,
+            initial_scales(spec.obs_dim, belief),
             pool.empty((self.pool, self.sequences * self.seq_len), belief, spec.action_dim),
             self.model_optimiser.init(model),  # pyright: ignore[reportArgumentType]
             double_q.init_optimisers(self.optimisers, controller),
@@ -210,36 +204,25 @@ class PredictiveSACAgent(ControllerAgent):
 
     # Acting
 
-    def perception(self, scales: Scales, step: Timestep) -> Float[Array, "*batch x"]:
-        """x_t = (o_t, a_{t-1}, r_{t-1}), observation and reward standardised."""
-        obs, reward = standardise(scales.obs, step.obs), standardise(scales.reward, step.reward[..., None])
-        return jnp.concatenate([obs, step.prev_action, reward], axis=-1)
-
-    def model_input(
-        self, scales: Scales, x: Float[Array, "*batch x"], rewards: Float[Array, "*batch constants"]
-    ) -> Float[Array, "*batch input"]:
-        """[x_t, m_t / σ_r], the second clipped as standardised inputs are."""
-        scale = scales.reward._replace(mean=jnp.zeros(1))
-        return jnp.concatenate([x, standardise(scale, rewards)], axis=-1)
-
     def reset(self, spec: Spec) -> Memory:
         empty = LSTMState(jnp.zeros(self.d_size), jnp.zeros(self.d_size))
-        return Memory(empty, jnp.zeros(len(self.reward_memory)))
+        policy = Policy(jnp.zeros(spec.action_dim), jnp.zeros(spec.action_dim))
+        return Memory(empty, jnp.zeros(len(self.reward_memory)), policy)
 
     def act(
         self, state: State, memory: Memory, step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]
     ) -> tuple[Float[Array, " action"], Memory]:
         scales = state.scales
-        x = self.perception(scales, step)
+        x = scales.perception(step)
         excess = jnp.where(step.is_first, 0.0, scales.usual.excess(step.reward))
         rewards = remember(memory.rewards, excess, self.reward_memory)
-        lstm = state.model.next_state(memory.lstm, self.model_input(scales, x, rewards), step.is_first)
+        lstm = state.model.next_state(memory.lstm, scales.model_input(x, rewards), step.is_first)
         belief = standardise(scales.belief, jnp.concatenate([lstm.d, x]))
-        return self.choose(state.controller, belief, key, explore), Memory(lstm, rewards)
+        action = self.choose(state.controller, belief, key, explore)
+        return action, Memory(lstm, rewards, state.controller.actor(belief))
 
-    def note(self, memory: Memory) -> Float[Array, " constants"]:
-        """m_t."""
-        return memory.rewards
+    def note(self, memory: Memory) -> Note:
+        return Note(memory.rewards, memory.policy)
 
     # Learning the model
 
@@ -251,19 +234,14 @@ class PredictiveSACAgent(ControllerAgent):
 
     def learn_model(self, state: State, windows: Window) -> tuple[State, Float[Array, "kept batch belief"], Metrics]:
         """One Adam step on J_model; also returns the beliefs after the burn-in, formed before the step."""
-        scales, step = state.scales, windows.step
-        obs = update_statistics(scales.obs, step.obs, windows.exists)
-        reward = update_statistics(scales.reward, step.reward[..., None], windows.exists & ~step.is_first)
-        scales = scales._replace(obs=obs, reward=reward)
-        x = self.perception(scales, step)
-        inputs = self.model_input(scales, x, windows.note)
+        scales, step = state.scales.include(windows), windows.step
+        x = scales.perception(step)
+        inputs = scales.model_input(x, windows.note.rewards)
 
         def loss(model: PredictiveModel) -> tuple[Float[Array, ""], Float[Array, "kept batch d"]]:
             d = model.unroll(inputs, step.is_first, self.burn_in)
-            after = windows.between(self.burn_in + 1, None).step
-            target = [standardise(scales.obs, after.obs), standardise(scales.reward, after.reward[..., None])]
-            valid = transitions(windows, self.burn_in)
-            return prediction_loss(model, d, after.prev_action, jnp.concatenate(target, axis=-1), valid), d
+            after, valid = windows.between(self.burn_in + 1, None).step, transitions(windows, self.burn_in)
+            return prediction_loss(model, d, after.prev_action, scales.prediction(after), valid), d
 
         (j_model, d), gradient = jax.value_and_grad(loss, has_aux=True)(state.model)
         model, optimiser = descend(self.model_optimiser, gradient, state.model_optimiser, state.model)
@@ -273,16 +251,36 @@ class PredictiveSACAgent(ControllerAgent):
 
     # Learning the controller
 
-    def begin_cycle(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Batch, Metrics]:
+    def begin_cycle(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Samples, Metrics]:
         """One update of the model; then a batch from the pool for each update of the controller."""
+        key_targets, key_draw = jax.random.split(key)
         state, belief, metrics = self.learn_model(state, windows)
-        found = pool.add(state.pool, self.transitions(windows, belief))
-        batches = pool.draw(found, key, (self.cycle, self.batch_size))
-        scale = state.scales.belief
-        beliefs = {name: standardise(scale, getattr(batches, name)) for name in ("belief", "next_belief")}
-        return state._replace(pool=found), batches._replace(**beliefs), metrics
+        samples, likeness = self.samples(state, windows, belief, key_targets)
+        found = pool.add(state.pool, samples)
+        batches = pool.draw(found, key_draw, (self.cycle, self.batch_size))
+        batches = batches._replace(belief=standardise(state.scales.belief, batches.belief))
+        return state._replace(pool=found), batches, metrics | {"likeness": likeness}
 
-    def update(self, state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
+    def samples(
+        self, state: State, windows: Window, belief: Float[Array, "kept batch belief"], key: Key[Array, ""]
+    ) -> tuple[Samples, Float[Array, ""]]:
+        """The transitions of windows after the burn-in with their targets; and the mean of min(1, π / μ)."""
+        after, valid = windows.between(self.burn_in, None), transitions(windows, self.burn_in)
+        y, likeness = double_q.targets(
+            state.controller,
+            standardise(state.scales.belief, belief),
+            after.step,
+            valid,
+            after.note.policy,
+            key,
+            self.gamma,
+            self.trace_decay,
+            self.off_policy_trace,
+        )
+        samples = Samples(belief[:-1], after.step.prev_action[1:], y, valid)
+        return samples, valid_mean(likeness.ravel(), valid.ravel())
+
+    def update(self, state: State, batch: Samples, key: Key[Array, ""]) -> tuple[State, Metrics]:
         controller, optimiser, metrics = double_q.update(
             self.optimisers,
             state.controller_optimiser,

@@ -1,11 +1,17 @@
 """Soft actor-critic without V, in units of its own returns: the controller of `predictive-sac`.
 
-Source: Haarnoja et al. 2019, Algorithm 1, where s is the belief and s' is the belief m steps later (`returns`):
+Source: Haarnoja et al. 2019, Algorithm 1, with λ-returns as the targets (`returns`), where s is the belief:
 
-    y   = r + γ^m (1 - terminated) min_i Q̄_i(s', ã')
-    J_Q = E ½ ((Q_i(s, a) - y) / u)²,  summed over i
-    J_π = E α log π(ã|s) - min_i Q_i(s, ã) / u  +  regulariser · ½ E μ²
-    J_α = E -log α (log π(ã|s) + H_target)
+    V̄(s) = min_i Q̄_i(s, ã)
+    y_t  = r_t + γ (1 - terminated) ((1 - c_{t+1}) V̄(s_{t+1}) + c_{t+1} y_{t+1})
+    c_t  = λ (ω + (1 - ω) min(1, π(a_t|s_t) / μ(a_t|s_t)))
+    J_Q  = E ½ ((Q_i(s, a) - y) / u)²,  summed over i
+    J_π  = E α log π(ã|s) - min_i Q_i(s, ã) / u  +  regulariser · ½ E μ(s)²
+    J_α  = E -log α (log π(ã|s) + H_target)
+
+μ(a|s) is the policy that chose a. So the returns of older and worse policies count less than those of the present one:
+with ω = 0 a return ends at the first action that the present policy would not choose, with ω = 1 it does not
+distinguish them.
 
 u is a running root mean square of y. The networks of the critics return Q / u. When u changes, their last layers are
 rescaled, so that Q stays the same (van Hasselt et al. 2016, without their mean). So one learning rate and one
@@ -21,11 +27,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.models.nets import MLP, descend, draw, tanh_gaussian
+from beliefrl.models.nets import MLP, descend, draw, gaussian_log_prob, tanh_gaussian
+from beliefrl.models.returns import lambda_returns
 from beliefrl.models.soft_actor_critic import (
     LOG_SIGMA_MAX,
     LOG_SIGMA_MIN,
-    Batch,
     Optimisers,
     OptimiserState,
     alpha_loss,
@@ -35,9 +41,27 @@ from beliefrl.models.soft_actor_critic import (
     valid_mean,
     wanted_entropy,
 )
+from beliefrl.types import Timestep
 
 UNIT_RATE = 1e-3  # smallest weight of a new batch in u², reached after 1 / rate batches
 UNIT_MIN = 1e-4
+ACTION_MAX = 1 - 1e-6  # so that the inverse of tanh is finite
+
+
+class Policy(NamedTuple):
+    """π(·|s): a Gaussian before the tanh."""
+
+    mean: Float[Array, "*batch action"]  # μ
+    log_sigma: Float[Array, "*batch action"]  # log σ
+
+
+class Samples(NamedTuple):
+    """Transitions with their targets."""
+
+    belief: Float[Array, "*batch belief"]  # s_t
+    action: Float[Array, "*batch action"]  # a_t
+    target: Float[Array, "*batch"]  # y_t
+    valid: Bool[Array, "*batch"]  # mask: False entries are ignored
 
 
 class OneTrunkActor(eqx.Module):
@@ -48,10 +72,10 @@ class OneTrunkActor(eqx.Module):
     def __init__(self, belief: int, action: int, layers: tuple[int, ...]):
         self.network = MLP((belief, *layers, 2 * action), jax.nn.relu)
 
-    def __call__(self, belief: Float[Array, " belief"]) -> tuple[Float[Array, " action"], Float[Array, " action"]]:
+    def __call__(self, belief: Float[Array, " belief"]) -> Policy:
         """μ and log σ before the tanh, log σ clipped to [-20, 2]."""
         mean, log_sigma = jnp.split(self.network(belief), 2)
-        return mean, jnp.clip(log_sigma, LOG_SIGMA_MIN, LOG_SIGMA_MAX)
+        return Policy(mean, jnp.clip(log_sigma, LOG_SIGMA_MIN, LOG_SIGMA_MAX))
 
 
 class Unit(NamedTuple):
@@ -108,11 +132,42 @@ def sample(
     return action, log_prob, mean
 
 
-def target(controller: DoubleQController, batch: Batch, key: Key[Array, ""]) -> Float[Array, " batch"]:
-    """y."""
-    action, _, _ = sample(controller.actor, batch.next_belief, key)
-    after = controller.unit.u * least(controller.targets, batch.next_belief, action)
-    return batch.reward + batch.discount * jnp.where(batch.terminated, 0.0, after)
+def likeness(policy: Policy, behaviour: Policy, action: Float[Array, "*batch action"]) -> Float[Array, "*batch"]:
+    """min(1, π(a|s) / μ(a|s)), from the densities before the tanh, because its derivative cancels."""
+    before = jnp.arctanh(jnp.clip(action, -ACTION_MAX, ACTION_MAX))
+    pi, mu = (gaussian_log_prob(before, each.mean, jnp.exp(each.log_sigma)) for each in (policy, behaviour))
+    return jnp.exp(jnp.minimum(jnp.sum(pi - mu, axis=-1), 0.0))
+
+
+def targets(
+    controller: DoubleQController,
+    belief: Float[Array, "time batch belief"],
+    step: Timestep,
+    valid: Bool[Array, "length batch"],
+    behaviour: Policy,
+    key: Key[Array, ""],
+    gamma: float,
+    decay: float,
+    off_policy: float,
+) -> tuple[Float[Array, "length batch"], Float[Array, "length batch"]]:
+    """y_t of the transitions between length + 1 timesteps, and min(1, π / μ) there.
+
+    Args:
+        controller: its actor is π.
+        belief, step: at the timesteps.
+        valid: as for `n_step_returns`.
+        behaviour: μ(·|s_t) at the timesteps.
+        key: the randomness of ã.
+        gamma, decay, off_policy: γ, λ and ω.
+    """
+    flat = belief.reshape(-1, belief.shape[-1])
+    policy = jax.vmap(controller.actor)(flat)
+    action, _ = jax.vmap(tanh_gaussian)(*policy, jax.random.normal(key, policy.mean.shape))
+    value = (controller.unit.u * least(controller.targets, flat, action)).reshape(belief.shape[:2])
+    policy = jax.tree.map(lambda leaf: leaf.reshape(*belief.shape[:2], -1)[:-1], policy)
+    like = likeness(policy, jax.tree.map(lambda leaf: leaf[:-1], behaviour), step.prev_action[1:])
+    trace = decay * (off_policy + (1 - off_policy) * like)
+    return lambda_returns(step, valid, value, trace, gamma), like
 
 
 def rescale(
@@ -135,15 +190,13 @@ def rescale(
     return controller._replace(critics=critics, targets=targets, unit=new)
 
 
-def q_loss(
-    critics: tuple[MLP, MLP], batch: Batch, y: Float[Array, " batch"], unit: Float[Array, ""]
-) -> Float[Array, ""]:
+def q_loss(critics: tuple[MLP, MLP], batch: Samples, unit: Float[Array, ""]) -> Float[Array, ""]:
     """J_Q of both critics, summed."""
-    return squared_errors(critics, batch, y / unit)
+    return squared_errors(critics, batch.belief, batch.action, batch.target / unit, batch.valid)
 
 
 def actor_loss(
-    actor: OneTrunkActor, controller: DoubleQController, batch: Batch, key: Key[Array, ""], regulariser: float
+    actor: OneTrunkActor, controller: DoubleQController, batch: Samples, key: Key[Array, ""], regulariser: float
 ) -> tuple[Float[Array, ""], tuple[Float[Array, " batch"], Float[Array, " batch"]]]:
     """J_π; also returns min_i Q_i(s, ã) / u and log π(ã|s)."""
     action, log_prob, mean = sample(actor, batch.belief, key)
@@ -156,7 +209,7 @@ def update(
     optimisers: Optimisers,
     state: OptimiserState,
     controller: DoubleQController,
-    batch: Batch,
+    batch: Samples,
     key: Key[Array, ""],
     tau: float,
     regulariser: float,
@@ -166,13 +219,11 @@ def update(
 
     `target_entropy` None is minus the number of action dimensions.
     """
-    key_target, key_actor = jax.random.split(key)
-    y = target(controller, batch, key_target)
-    controller = rescale(controller, y, batch.valid)
-    j_q, grad_critics = jax.value_and_grad(q_loss)(controller.critics, batch, y, controller.unit.u)
+    controller = rescale(controller, batch.target, batch.valid)
+    j_q, grad_critics = jax.value_and_grad(q_loss)(controller.critics, batch, controller.unit.u)
     differentiate = jax.value_and_grad(actor_loss, has_aux=True)
-    (j_pi, (q, log_prob)), grad_actor = differentiate(controller.actor, controller, batch, key_actor, regulariser)
-    entropy = wanted_entropy(batch, target_entropy)
+    (j_pi, (q, log_prob)), grad_actor = differentiate(controller.actor, controller, batch, key, regulariser)
+    entropy = wanted_entropy(batch.action, target_entropy)
     grad_alpha = jax.grad(alpha_loss)(controller.log_alpha, log_prob, batch.valid, entropy)
     actor, s_actor = descend(optimisers.actor, grad_actor, state.actor, controller.actor)
     critics, s_critics = descend(optimisers.critic, grad_critics, state.critic, controller.critics)

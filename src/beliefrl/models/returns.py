@@ -1,4 +1,4 @@
-"""The transitions from which the controller learns: over one step (the paper), or over n steps.
+"""The targets of the critics: transitions over one step (the paper) or over n steps, and λ-returns.
 
 With n steps the critics are trained towards
 
@@ -7,10 +7,18 @@ With n steps the critics are trained towards
 where m is n, or the number of steps that are left of the episode or the window. Information in V̄ then reaches Q in n
 times fewer updates. The actions in between were chosen by older policies, and their entropy is not counted. So the
 target is biased. The bias grows with n.
+
+A λ-return goes on to the end of the episode or the window, and mixes the values on its way. Here each timestep has a λ
+of its own, the trace c:
+
+    y_t = r_t + γ (1 - terminated) ((1 - c_{t+1}) V̄(s_{t+1}) + c_{t+1} y_{t+1})
+
+c is 0 at the last timestep of the episode or the window. With c = λ it is Peng's Q(λ) (Kozuno et al. 2021).
 """
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -76,3 +84,30 @@ def transition_batch(
         actor_input=None if actor_input is None else actor_input[:-1],
         discount=returns.discount,
     )
+
+
+def lambda_returns(
+    step: Timestep,
+    valid: Bool[Array, "length batch"],
+    value: Float[Array, "time batch"],
+    trace: Float[Array, "length batch"],
+    gamma: float,
+) -> Float[Array, "length batch"]:
+    """y_t of `length` transitions between length + 1 timesteps.
+
+    Args:
+        step: the timesteps.
+        valid: as for `n_step_returns`.
+        value: V̄(s_t) at every timestep.
+        trace: c_t; only those of valid transitions are used.
+        gamma: γ.
+    """
+
+    def backwards(ahead: Float[Array, " batch"], now: tuple) -> tuple[Float[Array, " batch"], Float[Array, " batch"]]:
+        """`ahead` is (1 - c_{t+1}) V̄(s_{t+1}) + c_{t+1} y_{t+1}."""
+        reward, terminated, value, trace = now
+        y = reward + gamma * jnp.where(terminated, 0.0, ahead)
+        return value + trace * (y - value), y
+
+    inputs = step.reward[1:], step.terminated[1:], value[:-1], jnp.where(valid, trace, 0.0)
+    return jax.lax.scan(backwards, value[-1], inputs, reverse=True)[1]

@@ -130,13 +130,20 @@ def value_loss(
 def q_loss(critics: tuple[MLP, MLP], target_value: MLP, batch: Batch) -> Float[Array, ""]:
     """J_Q of both critics, summed."""
     next_value = jnp.where(batch.terminated, 0.0, state_value(target_value, batch.next_belief))
-    return squared_errors(critics, batch, jax.lax.stop_gradient(batch.reward + batch.discount * next_value))
+    target = jax.lax.stop_gradient(batch.reward + batch.discount * next_value)
+    return squared_errors(critics, batch.belief, batch.action, target, batch.valid)
 
 
-def squared_errors(critics: tuple[MLP, MLP], batch: Batch, target: Float[Array, " batch"]) -> Float[Array, ""]:
+def squared_errors(
+    critics: tuple[MLP, MLP],
+    belief: Float[Array, "batch belief"],
+    action: Float[Array, "batch action"],
+    target: Float[Array, " batch"],
+    valid: Bool[Array, " batch"],
+) -> Float[Array, ""]:
     """E ½ (Q_i(s, a) - target)², summed over both critics."""
-    errors = [q_value(critic, batch.belief, batch.action) - target for critic in critics]
-    return valid_mean(0.5 * errors[0] ** 2 + 0.5 * errors[1] ** 2, batch.valid)
+    errors = [q_value(critic, belief, action) - target for critic in critics]
+    return valid_mean(0.5 * errors[0] ** 2 + 0.5 * errors[1] ** 2, valid)
 
 
 def actor_loss(
@@ -158,9 +165,9 @@ def alpha_loss(
     return -log_alpha * valid_mean(log_prob + target_entropy, valid)
 
 
-def wanted_entropy(batch: Batch, given: float | None) -> float:
+def wanted_entropy(action: Float[Array, "batch action"], given: float | None) -> float:
     """H_target: `given`, or minus the number of action dimensions."""
-    return -float(batch.action.shape[-1]) if given is None else given
+    return -float(action.shape[-1]) if given is None else given
 
 
 def loss(
@@ -182,7 +189,7 @@ def loss(
     alpha = jnp.exp(fixed.log_alpha)
     j_v = value_loss(controller.value, batch.belief, q - alpha * log_prob, batch.valid)
     j_q = q_loss(controller.critics, fixed.target_value, batch)
-    j_alpha = alpha_loss(controller.log_alpha, log_prob, batch.valid, wanted_entropy(batch, target_entropy))
+    j_alpha = alpha_loss(controller.log_alpha, log_prob, batch.valid, wanted_entropy(batch.action, target_entropy))
     metrics = {
         "loss_value": j_v,
         "loss_q": j_q,

@@ -1,0 +1,49 @@
+"""The running statistics by which `predictive-sac` standardises what it perceives and its belief."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from beliefrl.models.nets import RunningStatistics, initial_statistics, standardise, update_statistics
+from beliefrl.models.predictive_model import Usual
+from beliefrl.types import Timestep, Window
+
+
+class Scales(NamedTuple):
+    """Statistics of observations, rewards and beliefs, and which rewards are usual."""
+
+    obs: RunningStatistics
+    reward: RunningStatistics
+    belief: RunningStatistics
+    usual: Usual  # r̄ and δ, from the pre-training
+
+    def include(self, windows: Window) -> "Scales":
+        """With the observations and rewards of one more batch."""
+        step = windows.step
+        return self._replace(
+            obs=update_statistics(self.obs, step.obs, windows.exists),
+            reward=update_statistics(self.reward, step.reward[..., None], windows.exists & ~step.is_first),
+        )
+
+    def perception(self, step: Timestep) -> Float[Array, "*batch x"]:
+        """x_t = (o_t, a_{t-1}, r_{t-1}), observation and reward standardised."""
+        obs, reward = standardise(self.obs, step.obs), standardise(self.reward, step.reward[..., None])
+        return jnp.concatenate([obs, step.prev_action, reward], axis=-1)
+
+    def model_input(
+        self, x: Float[Array, "*batch x"], rewards: Float[Array, "*batch constants"]
+    ) -> Float[Array, "*batch input"]:
+        """[x_t, m_t / σ_r], the second clipped as standardised inputs are."""
+        scale = self.reward._replace(mean=jnp.zeros(1))
+        return jnp.concatenate([x, standardise(scale, rewards)], axis=-1)
+
+    def prediction(self, step: Timestep) -> Float[Array, "*batch prediction"]:
+        """(o_t, r_{t-1}), standardised: what the model predicts from h_{t-1} and a_{t-1}."""
+        obs, reward = standardise(self.obs, step.obs), standardise(self.reward, step.reward[..., None])
+        return jnp.concatenate([obs, reward], axis=-1)
+
+
+def initial_scales(obs: int, belief: int) -> Scales:
+    """The statistics before any batch, given the sizes of observations and beliefs."""
+    return Scales(*map(initial_statistics, (obs, 1, belief)), Usual(*jnp.zeros(3)))
