@@ -7,11 +7,11 @@ training, and only by predicting the next observation and reward (`models.predic
 
 This agent is not from the paper. It keeps the paper's idea: a recurrent model that learns by prediction forms the
 belief, and a soft actor-critic acts on it. It differs from `vrm` in this: one model instead of two, without latent
-variables and without a frozen copy; standardised inputs; returns of several steps; no V.
+variables and without a frozen copy; standardised inputs; λ-returns; no V.
 
 One unroll of the windows of a cycle serves both: the model learns from it, and its beliefs become transitions. A pool
-has the transitions of the last `pool` cycles, and the controller's batches are drawn from it. The windows of one cycle
-are too few and too correlated for a batch.
+has the transitions of the last `pool` cycles with their targets, and the controller's batches are drawn from it. The
+windows of one cycle are too few and too correlated for a batch.
 
 In training the newest weights act. Evaluations and the trained agent use an average of the last weights of the model
 and of the actor (`models.average`). The policy of the newest weights can change within few updates. The average changes
