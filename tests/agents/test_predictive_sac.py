@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from beliefrl.agents.predictive_sac import Note, PredictiveSACAgent
+from beliefrl.models import double_q
 from beliefrl.models.double_q import Policy
 from beliefrl.models.nets import standardise
 from beliefrl.models.pool import draw
@@ -148,20 +149,37 @@ def test_transitions_in_the_pool_are_aligned_in_time(state, begun):
 
 
 def test_targets_in_the_pool_are_those_of_the_window(state, begun):
-    """With λ = 0 a target is the next reward and value; with λ = 1 and ω = 1 it has all rewards of the window."""
+    """With λ = 1, ω = 1 and V̄ = 0 a target has the rewards until the end of the episode or of the window."""
     _, _, window = begun
-    step = jax.tree.map(lambda leaf: leaf[4:], window.step)
-    for decay in (0.0, 1.0):
-        agent = dataclasses.replace(AGENT, trace_decay=decay, off_policy_trace=1.0)
-        zero = jax.tree.map(jnp.zeros_like, state.controller.targets)  # V̄ = 0
-        valueless = state._replace(controller=state.controller._replace(targets=zero))
-        after, _, _ = jax.jit(agent.begin_cycle)(valueless, window, jax.random.key(2))
-        y = np.asarray(after.pool.transitions.target[0]).reshape(6, 2)
-        expected = np.zeros(2)
-        for t in reversed(range(6)):
-            expected = np.asarray(step.reward[t + 1]) + 0.995 * decay * expected * ~np.asarray(step.terminated[t + 1])
-            np.testing.assert_allclose(y[t], expected, rtol=1e-4, atol=1e-5)
-            expected = np.where(step.is_first[t], 0.0, expected)
+    first = window.step.is_first.at[7, 0].set(True)
+    terminated = window.step.terminated.at[6, 0].set(True).at[8, 1].set(True)
+    window = window._replace(step=window.step._replace(is_first=first, terminated=terminated))
+    agent = dataclasses.replace(AGENT, trace_decay=1.0, off_policy_trace=1.0)
+    zero = jax.tree.map(jnp.zeros_like, state.controller.targets)
+    valueless = state._replace(controller=state.controller._replace(targets=zero))
+    after, _, _ = jax.jit(agent.begin_cycle)(valueless, window, jax.random.key(2))
+    step, expected = jax.tree.map(lambda leaf: np.asarray(leaf[4:]), window.step), np.zeros(2)
+    y, valid = (np.asarray(leaf[0]).reshape(6, 2) for leaf in after.pool.transitions[2:])
+    np.testing.assert_array_equal(valid, ~step.is_first[1:])
+    for t in reversed(range(6)):
+        expected = step.reward[t + 1] + 0.995 * np.where(step.terminated[t + 1], 0.0, expected)
+        np.testing.assert_allclose(y[t][valid[t]], expected[valid[t]], rtol=1e-4, atol=1e-5)
+        expected = np.where(valid[t], expected, 0.0)
+
+
+def test_traces_use_the_policy_noted_at_their_timestep(state, begun):
+    _, _, window = begun
+    keys = jax.random.split(jax.random.key(7))
+    policy = Policy(*(0.5 * jax.random.normal(key, window.step.prev_action.shape) for key in keys))
+    window = window._replace(note=window.note._replace(policy=policy))
+    agent, key = dataclasses.replace(AGENT, trace_decay=0.8, off_policy_trace=0.0), jax.random.key(2)
+    after, _, _ = jax.jit(agent.begin_cycle)(state, window, key)
+    _, belief, _ = jax.jit(agent.learn_model)(state, window)
+    late, step = (jax.tree.map(lambda leaf: leaf[4:], tree) for tree in (policy, window.step))
+    valid, key = jnp.ones((6, 2), bool), jax.random.split(key)[0]
+    given = standardise(after.scales.belief, belief), step, valid, late, key, 0.995, 0.8, 0.0
+    y, _ = jax.jit(lambda: double_q.targets(state.controller, *given))()
+    np.testing.assert_allclose(after.pool.transitions.target[0], y.ravel(), rtol=1e-4, atol=1e-5)
 
 
 def test_a_batch_is_standardised_and_drawn_from_all_cycles_in_the_pool(state, begun):

@@ -47,10 +47,13 @@ class Memory(NamedTuple):
 
 
 class Note(NamedTuple):
-    """What the replay stores with a timestep."""
+    """What the replay stores with a timestep.
+
+    After the pre-training all notes are made anew. So in the exploration b is the untrained policy on the new beliefs.
+    """
 
     rewards: Float[Array, "*batch constants"]  # m_t
-    policy: Policy  # μ, which chose a_t
+    policy: Policy  # b, which chose a_t
 
 
 class State(NamedTuple):
@@ -73,10 +76,11 @@ class PredictiveSACAgent(ControllerAgent):
     gamma: float = 0.995
     """Discount factor γ, in [0, 1]."""
     trace_decay: float = 0.95
-    """λ of the λ-returns from which the critics learn, in [0, 1]. With 0, they have the reward of one step."""
+    """λ of the λ-returns from which the critics learn, in [0, 1]. With 0, a target has one
+    reward and the value of the next belief."""
     off_policy_trace: float = 0.5
-    """ω, the fraction of λ at actions that the present policy would not choose, in [0, 1]. With 1, λ-returns do not
-    distinguish between the actions of the present and of older policies."""
+    """ω, in [0, 1]: at an action that the present policy would not choose, the trace is ωλ. With 1, it is λ everywhere,
+    whichever policy chose the action."""
     train_interval_rl: int = 1
     """Environment steps between two updates of the model. The controller makes one update for each step."""
     batch_size: int = 128
@@ -264,7 +268,7 @@ class PredictiveSACAgent(ControllerAgent):
     def samples(
         self, state: State, windows: Window, belief: Float[Array, "kept batch belief"], key: Key[Array, ""]
     ) -> tuple[Samples, Float[Array, ""]]:
-        """The transitions of windows after the burn-in with their targets; and the mean of min(1, π / μ)."""
+        """The transitions of windows after the burn-in with their targets; and the mean of min(1, π / b)."""
         after, valid = windows.between(self.burn_in, None), transitions(windows, self.burn_in)
         y, likeness = double_q.targets(
             state.controller,

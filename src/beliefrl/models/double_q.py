@@ -4,14 +4,15 @@ Source: Haarnoja et al. 2019, Algorithm 1, with λ-returns as the targets (`retu
 
     V̄(s) = min_i Q̄_i(s, ã)
     y_t  = r_t + γ (1 - terminated) ((1 - c_{t+1}) V̄(s_{t+1}) + c_{t+1} y_{t+1})
-    c_t  = λ (ω + (1 - ω) min(1, π(a_t|s_t) / μ(a_t|s_t)))
+    c_t  = λ (ω + (1 - ω) min(1, π(a_t|s_t) / b(a_t|s_t)))
     J_Q  = E ½ ((Q_i(s, a) - y) / u)²,  summed over i
-    J_π  = E α log π(ã|s) - min_i Q_i(s, ã) / u  +  regulariser · ½ E μ(s)²
+    J_π  = E α log π(ã|s) - min_i Q_i(s, ã) / u  +  regulariser · ½ E μ²
     J_α  = E -log α (log π(ã|s) + H_target)
 
-μ(a|s) is the policy that chose a. So the returns of older and worse policies count less than those of the present one:
-with ω = 0 a return ends at the first action that the present policy would not choose, with ω = 1 it does not
-distinguish them.
+b is the policy that chose a. Where the present policy is less likely to choose a, the trace c is shorter, so the
+rewards after it count less. With ω = 0 a return ends at the first action that π would not choose. With ω = 1 all
+actions have the same trace. The ratio is that of Retrace (Munos et al. 2016). Retrace corrects with Q̄(s, a), this
+target with V̄(s), so it is biased where the policies differ.
 
 u is a running root mean square of y. The networks of the critics return Q / u. When u changes, their last layers are
 rescaled, so that Q stays the same (van Hasselt et al. 2016, without their mean). So one learning rate and one
@@ -133,10 +134,10 @@ def sample(
 
 
 def likeness(policy: Policy, behaviour: Policy, action: Float[Array, "*batch action"]) -> Float[Array, "*batch"]:
-    """min(1, π(a|s) / μ(a|s)), from the densities before the tanh, because its derivative cancels."""
+    """min(1, π(a|s) / b(a|s)), from the densities before the tanh, because its derivative cancels."""
     before = jnp.arctanh(jnp.clip(action, -ACTION_MAX, ACTION_MAX))
-    pi, mu = (gaussian_log_prob(before, each.mean, jnp.exp(each.log_sigma)) for each in (policy, behaviour))
-    return jnp.exp(jnp.minimum(jnp.sum(pi - mu, axis=-1), 0.0))
+    pi, b = (gaussian_log_prob(before, each.mean, jnp.exp(each.log_sigma)) for each in (policy, behaviour))
+    return jnp.exp(jnp.minimum(jnp.sum(pi - b, axis=-1), 0.0))
 
 
 def targets(
@@ -150,13 +151,13 @@ def targets(
     decay: float,
     off_policy: float,
 ) -> tuple[Float[Array, "length batch"], Float[Array, "length batch"]]:
-    """y_t of the transitions between length + 1 timesteps, and min(1, π / μ) there.
+    """y_t of the transitions between length + 1 timesteps, and min(1, π / b) there.
 
     Args:
         controller: its actor is π.
         belief, step: at the timesteps.
         valid: as for `n_step_returns`.
-        behaviour: μ(·|s_t) at the timesteps.
+        behaviour: b(·|s_t) at the timesteps.
         key: the randomness of ã.
         gamma, decay, off_policy: γ, λ and ω.
     """

@@ -10,7 +10,10 @@ from beliefrl.models.double_q import Samples
 
 
 class Pool(NamedTuple):
-    """The transitions of the last cycles, beliefs not standardised."""
+    """The transitions of the last cycles, beliefs not standardised.
+
+    A target is computed once, when its transition enters the pool.
+    """
 
     transitions: Samples  # leaves (cycles that fit, transitions of a cycle, ...)
     cycles: Int[Array, ""]  # so far

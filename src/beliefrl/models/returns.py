@@ -8,8 +8,8 @@ where m is n, or the number of steps that are left of the episode or the window.
 times fewer updates. The actions in between were chosen by older policies, and their entropy is not counted. So the
 target is biased. The bias grows with n.
 
-A λ-return goes on to the end of the episode or the window, and mixes the values on its way. Here each timestep has a λ
-of its own, the trace c:
+A λ-return is a weighted mean of the returns of 1, 2, 3, ... steps, to the end of the episode or the window. Here each
+timestep has a λ of its own, the trace c:
 
     y_t = r_t + γ (1 - terminated) ((1 - c_{t+1}) V̄(s_{t+1}) + c_{t+1} y_{t+1})
 

@@ -46,4 +46,5 @@ class Scales(NamedTuple):
 
 def initial_scales(obs: int, belief: int) -> Scales:
     """The statistics before any batch, given the sizes of observations and beliefs."""
-    return Scales(*map(initial_statistics, (obs, 1, belief)), Usual(*jnp.zeros(3)))
+    of_obs, of_reward, of_belief = map(initial_statistics, (obs, 1, belief))
+    return Scales(of_obs, of_reward, of_belief, Usual(*jnp.zeros(3)))
