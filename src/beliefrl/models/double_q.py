@@ -50,7 +50,7 @@ ACTION_MAX = 1 - 1e-6  # so that the inverse of tanh is finite
 
 
 class Policy(NamedTuple):
-    """π(·|s): a Gaussian before the tanh."""
+    """π(a|s): a Gaussian before the tanh."""
 
     mean: Float[Array, "*batch action"]  # μ
     log_sigma: Float[Array, "*batch action"]  # log σ
@@ -157,7 +157,7 @@ def targets(
         controller: its actor is π.
         belief, step: at the timesteps.
         valid: as for `n_step_returns`.
-        behaviour: b(·|s_t) at the timesteps.
+        behaviour: b(a|s_t) at the timesteps.
         key: the randomness of ã.
         gamma, decay, off_policy: γ, λ and ω.
     """
