@@ -100,7 +100,7 @@ def test_equal_rewards_tell_no_time(state):
         for t in range(3):
             now = step._replace(is_first=jnp.array(t == 0), reward=jnp.array(float(t > 0)))
             _, memory = jax.jit(AGENT.act)(trained, memory, now, jax.random.key(t), jnp.array(False))
-        np.testing.assert_array_equal(memory.rewards, 0.0)
+        np.testing.assert_array_equal(memory.note.rewards, 0.0)
 
 
 def test_pretraining_learns_which_rewards_are_usual_and_what_follows_does_not_change_it(state):
@@ -133,7 +133,7 @@ def test_an_actor_notes_the_policy_that_chose_its_action(state):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), policy, expected)
     np.testing.assert_allclose(mode, jnp.tanh(policy.mean), rtol=1e-5)
     _, sampled = jax.jit(AGENT.act)(state, AGENT.reset(SPEC), step, jax.random.key(0), jnp.array(True))
-    assert same(sampled.policy, policy)
+    assert same(sampled.note.policy, policy)
 
 
 def test_transitions_in_the_pool_are_aligned_in_time(state, begun):

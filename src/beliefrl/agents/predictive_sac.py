@@ -38,22 +38,21 @@ from beliefrl.models.soft_actor_critic import OptimiserState, valid_mean
 from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range, transitions
 
 
-class Memory(NamedTuple):
-    """The recurrent state of an actor."""
-
-    lstm: LSTMState
-    rewards: Float[Array, "*batch constants"]  # m_t, in units of the reward
-    policy: Policy  # the policy that chose the last action
-
-
 class Note(NamedTuple):
     """What the replay stores with a timestep.
 
     After the pre-training all notes are made anew. So in the exploration b is the untrained policy on the new beliefs.
     """
 
-    rewards: Float[Array, "*batch constants"]  # m_t
+    rewards: Float[Array, "*batch constants"]  # m_t, in units of the reward
     policy: Policy  # b, which chose a_t
+
+
+class Memory(NamedTuple):
+    """The recurrent state of an actor."""
+
+    lstm: LSTMState
+    note: Note  # on the last timestep
 
 
 class State(NamedTuple):
@@ -76,8 +75,8 @@ class PredictiveSACAgent(ControllerAgent):
     gamma: float = 0.995
     """Discount factor γ, in [0, 1]."""
     trace_decay: float = 0.95
-    """λ of the λ-returns from which the critics learn, in [0, 1]. With 0, a target has one
-    reward and the value of the next belief."""
+    """λ of the λ-returns from which the critics learn, in [0, 1]. With 0, a target has one reward and the value
+    of the next belief."""
     off_policy_trace: float = 0.5
     """ω, in [0, 1]: at an action that the present policy would not choose, the trace is ωλ. With 1, it is λ everywhere,
     whichever policy chose the action."""
@@ -211,7 +210,7 @@ class PredictiveSACAgent(ControllerAgent):
     def reset(self, spec: Spec) -> Memory:
         empty = LSTMState(jnp.zeros(self.d_size), jnp.zeros(self.d_size))
         policy = Policy(jnp.zeros(spec.action_dim), jnp.zeros(spec.action_dim))
-        return Memory(empty, jnp.zeros(len(self.reward_memory)), policy)
+        return Memory(empty, Note(jnp.zeros(len(self.reward_memory)), policy))
 
     def act(
         self, state: State, memory: Memory, step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]
@@ -219,14 +218,14 @@ class PredictiveSACAgent(ControllerAgent):
         scales = state.scales
         x = scales.perception(step)
         excess = jnp.where(step.is_first, 0.0, scales.usual.excess(step.reward))
-        rewards = remember(memory.rewards, excess, self.reward_memory)
+        rewards = remember(memory.note.rewards, excess, self.reward_memory)
         lstm = state.model.next_state(memory.lstm, scales.model_input(x, rewards), step.is_first)
         belief = standardise(scales.belief, jnp.concatenate([lstm.d, x]))
-        action = self.choose(state.controller, belief, key, explore)
-        return action, Memory(lstm, rewards, state.controller.actor(belief))
+        policy = state.controller.actor(belief)
+        return self.choose_from(policy, key, explore), Memory(lstm, Note(rewards, policy))
 
     def note(self, memory: Memory) -> Note:
-        return Note(memory.rewards, memory.policy)
+        return memory.note
 
     # Learning the model
 

@@ -126,11 +126,11 @@ def init_controller(
 
 def sample(
     actor: OneTrunkActor, belief: Float[Array, "batch belief"], key: Key[Array, ""]
-) -> tuple[Float[Array, "batch action"], Float[Array, " batch"], Float[Array, "batch action"]]:
-    """ã, log π(ã|s) and μ."""
-    mean, log_sigma = jax.vmap(actor)(belief)
-    action, log_prob = jax.vmap(tanh_gaussian)(mean, log_sigma, jax.random.normal(key, mean.shape))
-    return action, log_prob, mean
+) -> tuple[Float[Array, "batch action"], Float[Array, " batch"], Policy]:
+    """ã, log π(ã|s) and π(a|s)."""
+    policy = jax.vmap(actor)(belief)
+    action, log_prob = jax.vmap(tanh_gaussian)(*policy, jax.random.normal(key, policy.mean.shape))
+    return action, log_prob, policy
 
 
 def likeness(policy: Policy, behaviour: Policy, action: Float[Array, "*batch action"]) -> Float[Array, "*batch"]:
@@ -162,8 +162,7 @@ def targets(
         gamma, decay, off_policy: γ, λ and ω.
     """
     flat = belief.reshape(-1, belief.shape[-1])
-    policy = jax.vmap(controller.actor)(flat)
-    action, _ = jax.vmap(tanh_gaussian)(*policy, jax.random.normal(key, policy.mean.shape))
+    action, _, policy = sample(controller.actor, flat, key)
     value = (controller.unit.u * least(controller.targets, flat, action)).reshape(belief.shape[:2])
     policy = jax.tree.map(lambda leaf: leaf.reshape(*belief.shape[:2], -1)[:-1], policy)
     like = likeness(policy, jax.tree.map(lambda leaf: leaf[:-1], behaviour), step.prev_action[1:])
@@ -200,9 +199,9 @@ def actor_loss(
     actor: OneTrunkActor, controller: DoubleQController, batch: Samples, key: Key[Array, ""], regulariser: float
 ) -> tuple[Float[Array, ""], tuple[Float[Array, " batch"], Float[Array, " batch"]]]:
     """J_π; also returns min_i Q_i(s, ã) / u and log π(ã|s)."""
-    action, log_prob, mean = sample(actor, batch.belief, key)
+    action, log_prob, policy = sample(actor, batch.belief, key)
     q = least(controller.critics, batch.belief, action)
-    size = 0.5 * regulariser * jnp.mean(mean**2, axis=-1)
+    size = 0.5 * regulariser * jnp.mean(policy.mean**2, axis=-1)
     return valid_mean(jnp.exp(controller.log_alpha) * log_prob - q + size, batch.valid), (q, log_prob)
 
 

@@ -26,9 +26,13 @@ class Scales(NamedTuple):
             reward=update_statistics(self.reward, step.reward[..., None], windows.exists & ~step.is_first),
         )
 
+    def standardised(self, step: Timestep) -> tuple[Float[Array, "*batch obs"], Float[Array, "*batch 1"]]:
+        """o_t and r_{t-1}, standardised."""
+        return standardise(self.obs, step.obs), standardise(self.reward, step.reward[..., None])
+
     def perception(self, step: Timestep) -> Float[Array, "*batch x"]:
         """x_t = (o_t, a_{t-1}, r_{t-1}), observation and reward standardised."""
-        obs, reward = standardise(self.obs, step.obs), standardise(self.reward, step.reward[..., None])
+        obs, reward = self.standardised(step)
         return jnp.concatenate([obs, step.prev_action, reward], axis=-1)
 
     def model_input(
@@ -40,8 +44,7 @@ class Scales(NamedTuple):
 
     def prediction(self, step: Timestep) -> Float[Array, "*batch prediction"]:
         """(o_t, r_{t-1}), standardised: what the model predicts from h_{t-1} and a_{t-1}."""
-        obs, reward = standardise(self.obs, step.obs), standardise(self.reward, step.reward[..., None])
-        return jnp.concatenate([obs, reward], axis=-1)
+        return jnp.concatenate(self.standardised(step), axis=-1)
 
 
 def initial_scales(obs: int, belief: int) -> Scales:
