@@ -48,7 +48,7 @@ def noted(window, excess=lambda reward: reward):
 
 def usual(state, reward, deviation):
     """The state after a pre-training on rewards with this median and this mean deviation."""
-    return state._replace(scales=state.scales._replace(usual=Usual(*map(jnp.array, (reward, deviation, 1.0)))))
+    return state._replace(scales=state.scales._replace(usual=Usual(*map(jnp.array, (reward, deviation, 1.0, 1.0)))))
 
 
 @pytest.fixture(scope="module")
@@ -108,12 +108,35 @@ def test_pretraining_learns_which_rewards_are_usual_and_what_follows_does_not_ch
     window = noted(windows(jax.random.key(1), 2, TIME))
     window = window._replace(step=window.step._replace(reward=rewards))
     trained, _ = jax.jit(AGENT.pretrain)(state, window, jax.random.key(2))
-    np.testing.assert_allclose(trained.scales.usual, (1.0, 10 / 20, 1.0), rtol=1e-6)
+    np.testing.assert_allclose(trained.scales.usual, (1.0, 10 / 20, 18 / 20, 1.0), rtol=1e-6)
     np.testing.assert_allclose(trained.scales.usual.excess(jnp.array(3.5)), 0.0)  # five deviations
     np.testing.assert_allclose(trained.scales.usual.excess(jnp.array(3.6)), 2.6)
     np.testing.assert_allclose(trained.scales.usual.excess(jnp.array(-3.0)), -4.0)
     later, _, _ = jax.jit(AGENT.begin_cycle)(trained, window, jax.random.key(3))
     assert same(later.scales.usual, trained.scales.usual)
+
+
+@pytest.mark.parametrize(
+    ("rewards", "gamma"),
+    [
+        (jnp.ones((TIME, 2)), 0.995),
+        (jnp.zeros((TIME, 2)).at[3, 0].set(100.0), 0.995),  # sparse
+        (jnp.linspace(-0.1, 0.1, 2 * TIME).reshape(TIME, 2).at[3, 0].set(100.0), 0.995),  # sparse, with small costs
+        (jnp.linspace(-0.1, 0.1, 2 * TIME).reshape(TIME, 2), 0.97),
+        (1.0 + jax.random.normal(jax.random.key(3), (TIME, 2)), 0.97),
+    ],
+)
+def test_the_discount_depends_on_whether_most_rewards_are_alike(state, begun, rewards, gamma):
+    """The targets of the critics have the discount that the pre-training has found, or the one that is given."""
+    window = begun[2]
+    window = window._replace(step=window.step._replace(reward=rewards))
+    trained, _ = jax.jit(AGENT.pretrain)(state, window, jax.random.key(2))
+    given = dataclasses.replace(AGENT, gamma=gamma)
+    found, chosen = (jax.jit(agent.begin_cycle)(trained, window, jax.random.key(3)) for agent in (AGENT, given))
+    assert found[2]["gamma"] == chosen[2]["gamma"] == np.float32(gamma)
+    assert same(found[0].pool, chosen[0].pool)
+    other = jax.jit(dataclasses.replace(AGENT, gamma=0.5).begin_cycle)(trained, window, jax.random.key(3))
+    assert not same(found[0].pool, other[0].pool)
 
 
 def test_the_memory_of_rewards_decays():
@@ -262,6 +285,7 @@ def test_what_does_not_exist_changes_nothing(state):
     ("field", "value"),
     [
         ("pool", 0),
+        ("gamma", 1.5),
         ("long_memories", 1.5),
         ("trace_decay", 1.5),
         ("off_policy_trace", -0.1),

@@ -37,6 +37,9 @@ from beliefrl.models.scales import Scales, initial_scales
 from beliefrl.models.soft_actor_critic import OptimiserState, valid_mean
 from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range, transitions
 
+GAMMA_VARIED = 0.97  # γ if rewards vary from step to step
+GAMMA_FLAT = 0.995  # γ if most rewards are alike
+
 
 class Note(NamedTuple):
     """What the replay stores with a timestep.
@@ -72,8 +75,9 @@ class PredictiveSACAgent(ControllerAgent):
     """Soft actor-critic on an LSTM that learns only to predict observations and rewards. It is not in the paper."""
 
     # The controller
-    gamma: float = 0.995
-    """Discount factor γ, in [0, 1]."""
+    gamma: float | None = None
+    """Discount factor γ, in [0, 1]. None: 0.995 if most rewards of the exploration are alike, as on CartPole, and else
+    0.97."""
     trace_decay: float = 0.95
     """λ of the λ-returns from which the critics learn, in [0, 1]. With 0, a target has one reward and the value
     of the next belief."""
@@ -130,6 +134,7 @@ class PredictiveSACAgent(ControllerAgent):
     evaluated."""
 
     ranges = ControllerAgent.ranges | {
+        "gamma": (None, 0.95, 0.98, 0.99, 0.998),
         "batch_size": (64, 128, 256, 512),
         "trace_decay": Range(0.8, 1.0),
         "tau": Range(5e-3, 5e-2, "log"),
@@ -147,6 +152,8 @@ class PredictiveSACAgent(ControllerAgent):
         check_range(self, ("d_size", "hidden_size"), 1, WIDEST)
         check_range(self, ("burn_in", "pretrain_updates"), 0)
         check_range(self, ("alpha_start",), 1e-6)
+        if self.gamma is not None:
+            check_range(self, ("gamma",), 0, 1)
         check_range(self, ("lr_model", "long_memories", "trace_decay", "off_policy_trace"), 0, 1)
         check_range(self, ("average_rate",), 1e-6, 1)
         check_range(self, ("reward_memory",), 1)
@@ -262,24 +269,22 @@ class PredictiveSACAgent(ControllerAgent):
         found = pool.add(state.pool, samples)
         batches = pool.draw(found, key_draw, (self.cycle, self.batch_size))
         batches = batches._replace(belief=standardise(state.scales.belief, batches.belief))
-        return state._replace(pool=found), batches, metrics | {"likeness": likeness}
+        return state._replace(pool=found), batches, metrics | {"likeness": likeness, "gamma": self.discount(state)}
+
+    def discount(self, state: State) -> Float[Array, ""]:
+        """γ. If rewards vary, each says how good its step was. If most are alike, the agent must look further ahead."""
+        found = jnp.where(state.scales.usual.is_flat, GAMMA_FLAT, GAMMA_VARIED)
+        return found if self.gamma is None else jnp.asarray(self.gamma)
 
     def samples(
         self, state: State, windows: Window, belief: Float[Array, "kept batch belief"], key: Key[Array, ""]
     ) -> tuple[Samples, Float[Array, ""]]:
         """The transitions of windows after the burn-in with their targets; and the mean of min(1, π / b)."""
         after, valid = windows.between(self.burn_in, None), transitions(windows, self.burn_in)
-        y, likeness = double_q.targets(
-            state.controller,
-            standardise(state.scales.belief, belief),
-            after.step,
-            valid,
-            after.note.policy,
-            key,
-            self.gamma,
-            self.trace_decay,
-            self.off_policy_trace,
-        )
+        belief_std = standardise(state.scales.belief, belief)
+        given = belief_std, after.step, valid, after.note.policy, key
+        discounts = self.discount(state), self.trace_decay, self.off_policy_trace
+        y, likeness = double_q.targets(state.controller, *given, *discounts)
         samples = Samples(belief[:-1], after.step.prev_action[1:], y, valid)
         return samples, valid_mean(likeness.ravel(), valid.ravel())
 
