@@ -113,6 +113,10 @@ def test_an_mp4_without_its_encoder_is_an_error_in_one_sentence(tmp_path, run, m
 def test_a_strip_is_evenly_spaced_from_the_first_timestep_to_the_last(run):
     assert list(films._strip(restore_seed(run), 3, 0, False, None).frames) == [0, 2, 5]
     assert list(films._strip(restore_seed(run), 8, 0, False, 3).frames) == [0, 1, 2, 3]
+    assert list(films._strip(restore_seed(run), 3, 0, False, None, 3).frames) == [3, 4, 5]
+    for start, sentence in ((5, "the episode ends at step 5"), (-1, "it must be a whole number")):
+        with pytest.raises(UserError, match=f"^start={start} is impossible: {sentence}"):
+            films.film([run], start=start)
 
 
 def test_a_strip_says_that_the_numbers_below_its_frames_are_steps(run, monkeypatch):

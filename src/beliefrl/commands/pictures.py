@@ -80,6 +80,8 @@ class FilmOptions:
     """The strip to write, as PNG and as PDF. None: film.png in the first run's folder."""
     frames: int = 8
     """Number of frames in a row."""
+    start: int = 0
+    """Step of the first frame."""
     steps: int | None = None
     """Stop the episodes after this many steps. None: play until the task ends them."""
     seed: int | None = None
@@ -140,7 +142,7 @@ def film(argv: Sequence[str]) -> None:
     options = parse(FilmOptions, argv, "beliefrl film")
     from beliefrl.viewing import films
 
-    names = ("frames", "seed", "episode_seed", "sampled", "best", "steps")
+    names = ("frames", "start", "seed", "episode_seed", "sampled", "best", "steps")
     given = {name: getattr(options, name) for name in names}
     _written(films.film(options.runs, options.out, agent=own_agent(options.agent), **given))
 

@@ -219,8 +219,9 @@ def film(
     task: Task | GymnasiumTask | None = None,
     agent: Agent | type | None = None,
     best: bool = False,
+    start: int = 0,
 ) -> pathlib.Path:
-    """Draw a film strip: one row per run, with evenly spaced frames of one episode, from its first to its last step.
+    """Draw a film strip: one row per run, with evenly spaced frames of one episode, up to its last step.
 
     The step is written below each frame. Writes a PNG and a PDF; returns the path of the PNG.
 
@@ -235,12 +236,15 @@ def film(
         task: needed only if the runs were trained on a task of your own.
         agent: needed only if the run was trained by an agent of your own: its class, or an instance.
         best: take the seed's best agent, not its last one; see `evaluate`.
+        start: step of the first frame.
 
     Raises:
-        UserError: there is no such run or seed, a number is impossible, or a task cannot be rendered.
+        UserError: there is no such run or seed, a number is impossible, an episode ends before `start`, or a task
+            cannot be rendered.
     """
     check_episode(episode_seed, steps)
     check_whole("frames", frames, 2, 100)
+    check_whole("start", start, 0)
     if not runs:
         raise UserError("RUN is missing: give one or more runs.")
     runs = [run if isinstance(run, Run) else Run(run) for run in runs]
@@ -248,19 +252,26 @@ def film(
     figures.paths(path)
     own = [agent if is_own(run.config["agent"]) else None for run in runs]
     rows = [
-        _strip(restore_seed(run, seed, task, made_by, best), frames, episode_seed, sampled, steps)
+        _strip(restore_seed(run, seed, task, made_by, best), frames, episode_seed, sampled, steps, start)
         for run, made_by in zip(runs, own, strict=True)
     ]
     return figures.save(_draw_strips(runs, rows), path)
 
 
 def _strip(
-    restored: tuple[Agent, Any, Any, str], frames: int, episode_seed: int, sampled: bool, steps: int | None
+    restored: tuple[Agent, Any, Any, str],
+    frames: int,
+    episode_seed: int,
+    sampled: bool,
+    steps: int | None,
+    start: int = 0,
 ) -> Trajectory:
     """An episode with evenly spaced frames. It is played twice, since the first time gives its length."""
     with Player(*restored, rendered=True) as player:
         length = len(player.play(episode_seed, sampled, steps).steps.reward) - 1
-        at = {round(time) for time in np.linspace(0, length, frames)}
+        if start >= length:
+            raise UserError(f"start={start} is impossible: the episode ends at step {length}.")
+        at = {round(time) for time in np.linspace(start, length, frames)}
         return player.play(episode_seed, sampled, steps, at)
 
 
