@@ -37,8 +37,8 @@ from beliefrl.models.scales import Scales, initial_scales
 from beliefrl.models.soft_actor_critic import OptimiserState, valid_mean
 from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range, transitions
 
-GAMMA_VARIED = 0.97  # γ if rewards vary from step to step
-GAMMA_FLAT = 0.995  # γ if most rewards are alike
+GAMMA_FLAT = 0.995  # γ if most rewards of the exploration are alike
+GAMMA_VARIED = 0.97  # γ if they vary from step to step
 
 
 class Note(NamedTuple):
@@ -76,8 +76,8 @@ class PredictiveSACAgent(ControllerAgent):
 
     # The controller
     gamma: float | None = None
-    """Discount factor γ, in [0, 1]. None: 0.995 if most rewards of the exploration are alike, as on CartPole, and else
-    0.97."""
+    """Discount factor γ, in [0, 1]. None: it depends on the rewards of the exploration. If most of them are alike, as on
+    CartPole, it is 0.995, and else 0.97."""
     trace_decay: float = 0.95
     """λ of the λ-returns from which the critics learn, in [0, 1]. With 0, a target has one reward and the value
     of the next belief."""
