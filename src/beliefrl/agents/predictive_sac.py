@@ -76,8 +76,8 @@ class PredictiveSACAgent(ControllerAgent):
 
     # The controller
     gamma: float | None = None
-    """Discount factor γ, in [0, 1]. None: it depends on the rewards of the exploration. If most of them are alike, as on
-    CartPole, it is 0.995, and else 0.97."""
+    """Discount factor γ, in [0, 1]. None: it depends on the rewards of the exploration. If most of them are alike, it is
+    0.995, and else 0.97."""
     trace_decay: float = 0.95
     """λ of the λ-returns from which the critics learn, in [0, 1]. With 0, a target has one reward and the value
     of the next belief."""
