@@ -158,6 +158,7 @@ MISTAKES = {
     "predict untrained --out nowhere/picture.png": "there is no folder nowhere",
     "video": "RUN is missing",
     "video untrained": "FILE is missing",
+    "film untrained --start -1": "start=-1 is impossible",
     "video missing film.gif": "no run folder missing",
     "video untrained film.gif": "untrained has no trained agent yet",
     "video untrained film": "must end in .mp4 or .gif",

@@ -124,6 +124,9 @@ def test_pretraining_learns_which_rewards_are_usual_and_what_follows_does_not_ch
         (jnp.linspace(-0.1, 0.1, 2 * TIME).reshape(TIME, 2).at[3, 0].set(100.0), 0.995),  # sparse, with small costs
         (jnp.linspace(-0.1, 0.1, 2 * TIME).reshape(TIME, 2), 0.97),
         (1.0 + jax.random.normal(jax.random.key(3), (TIME, 2)), 0.97),
+        (jnp.where(jnp.arange(2 * TIME) < 2 * TIME * 0.65, 0.0, jnp.arange(2.0 * TIME)).reshape(TIME, 2), 0.995),
+        (jnp.where(jnp.arange(2 * TIME) < 2 * TIME * 0.4, 7.0, jnp.arange(2.0 * TIME)).reshape(TIME, 2), 0.97),
+        (jnp.tile(jnp.array([-1.0, -0.2, 0.0, 0.2, 1.0]), 5)[: 2 * TIME].reshape(TIME, 2), 0.97),  # 0.4 δ is not alike
     ],
 )
 def test_the_discount_depends_on_whether_most_rewards_are_alike(state, begun, rewards, gamma):
@@ -137,6 +140,17 @@ def test_the_discount_depends_on_whether_most_rewards_are_alike(state, begun, re
     assert same(found[0].pool, chosen[0].pool)
     other = jax.jit(dataclasses.replace(AGENT, gamma=0.5).begin_cycle)(trained, window, jax.random.key(3))
     assert not same(found[0].pool, other[0].pool)
+
+
+def test_usual_rewards_are_averages_over_the_batches():
+    before, valid = Usual(*jnp.zeros(4)), jnp.ones(4, bool)
+    assert before.is_flat
+    for rewards in ([0.0, 0.0, 0.0, 8.0], [1.0, 2.0, 4.0, 5.0]):
+        before = before.include(jnp.array(rewards), valid)
+    np.testing.assert_allclose(before, ((0 + 3) / 2, (2 + 1.5) / 2, (3 / 4 + 0) / 2, 2), rtol=1e-6)
+    assert not before.is_flat
+    none = before.include(jnp.array([9.0, 9.0, 9.0, 9.0]), ~valid)
+    assert same(none, before)
 
 
 def test_the_memory_of_rewards_decays():

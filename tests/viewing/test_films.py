@@ -2,6 +2,7 @@
 
 import fnmatch
 import pathlib
+import re
 import subprocess
 import sys
 import tomllib
@@ -114,9 +115,14 @@ def test_a_strip_is_evenly_spaced_from_the_first_timestep_to_the_last(run):
     assert list(films._strip(restore_seed(run), 3, 0, False, None).frames) == [0, 2, 5]
     assert list(films._strip(restore_seed(run), 8, 0, False, 3).frames) == [0, 1, 2, 3]
     assert list(films._strip(restore_seed(run), 3, 0, False, None, 3).frames) == [3, 4, 5]
-    for start, sentence in ((5, "the episode ends at step 5"), (-1, "it must be a whole number")):
-        with pytest.raises(UserError, match=f"^start={start} is impossible: {sentence}"):
-            films.film([run], start=start)
+    ends = f"the episode of {run.folder} ends at step 5"
+    for start, steps, sentence in (
+        (5, None, ends),
+        (-1, None, "it must be a whole number"),
+        (3, 3, "less than steps=3"),
+    ):
+        with pytest.raises(UserError, match=f"^start={start} is impossible: .*{re.escape(sentence)}"):
+            films.film([run], start=start, steps=steps)
 
 
 def test_a_strip_says_that_the_numbers_below_its_frames_are_steps(run, monkeypatch):

@@ -76,8 +76,8 @@ class PredictiveSACAgent(ControllerAgent):
 
     # The controller
     gamma: float | None = None
-    """Discount factor γ, in [0, 1]. None: it depends on the rewards of the exploration. If most of them are alike, it is
-    0.995, and else 0.97."""
+    """Discount factor γ, in [0, 1]. None: it depends on the rewards of the exploration. If most of them are alike, or
+    if there is no pre-training, it is 0.995, and else 0.97. With `--init-from` it is that of the other run."""
     trace_decay: float = 0.95
     """λ of the λ-returns from which the critics learn, in [0, 1]. With 0, a target has one reward and the value
     of the next belief."""
@@ -274,7 +274,7 @@ class PredictiveSACAgent(ControllerAgent):
     def discount(self, state: State) -> Float[Array, ""]:
         """γ. If rewards vary, each says how good its step was. If most are alike, the agent must look further ahead."""
         found = jnp.where(state.scales.usual.is_flat, GAMMA_FLAT, GAMMA_VARIED)
-        return found if self.gamma is None else jnp.asarray(self.gamma)
+        return found if self.gamma is None else jnp.asarray(self.gamma, float)
 
     def samples(
         self, state: State, windows: Window, belief: Float[Array, "kept batch belief"], key: Key[Array, ""]

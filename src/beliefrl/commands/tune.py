@@ -35,7 +35,7 @@ class TuneOptions:
     range: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=LOW..HIGH|A,B,C")] = ()
     """Ranges to try, for example lr_critic=1e-4..1e-2 or d_size=64,128. They replace or extend the agent's own. The
     scale is that of the agent's own range, or linear; LOW..HIGH:log and LOW..HIGH:horizon set it. horizon is
-    logarithmic in 1 - value, as for gamma."""
+    logarithmic in 1 - value, as for gamma of vrm."""
     only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME")] = ()
     """Hyperparameters to tune. None: all that have a range."""
     set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()

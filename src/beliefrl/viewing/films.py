@@ -236,15 +236,17 @@ def film(
         task: needed only if the runs were trained on a task of your own.
         agent: needed only if the run was trained by an agent of your own: its class, or an instance.
         best: take the seed's best agent, not its last one; see `evaluate`.
-        start: step of the first frame.
+        start: step of the first frame, counted as `steps` from the start of the episode.
 
     Raises:
-        UserError: there is no such run or seed, a number is impossible, an episode ends before `start`, or a task
-            cannot be rendered.
+        UserError: there is no such run or seed, a number is impossible, an episode ends at or before `start`, or a
+            task cannot be rendered.
     """
     check_episode(episode_seed, steps)
     check_whole("frames", frames, 2, 100)
     check_whole("start", start, 0)
+    if steps is not None and start >= steps:
+        raise UserError(f"start={start} is impossible: it must be less than steps={steps}.")
     if not runs:
         raise UserError("RUN is missing: give one or more runs.")
     runs = [run if isinstance(run, Run) else Run(run) for run in runs]
@@ -252,7 +254,9 @@ def film(
     figures.paths(path)
     own = [agent if is_own(run.config["agent"]) else None for run in runs]
     rows = [
-        _strip(restore_seed(run, seed, task, made_by, best), frames, episode_seed, sampled, steps, start)
+        _strip(
+            restore_seed(run, seed, task, made_by, best), frames, episode_seed, sampled, steps, start, str(run.folder)
+        )
         for run, made_by in zip(runs, own, strict=True)
     ]
     return figures.save(_draw_strips(runs, rows), path)
@@ -265,12 +269,13 @@ def _strip(
     sampled: bool,
     steps: int | None,
     start: int = 0,
+    folder: str = "the run",
 ) -> Trajectory:
     """An episode with evenly spaced frames. It is played twice, since the first time gives its length."""
     with Player(*restored, rendered=True) as player:
         length = len(player.play(episode_seed, sampled, steps).steps.reward) - 1
         if start >= length:
-            raise UserError(f"start={start} is impossible: the episode ends at step {length}.")
+            raise UserError(f"start={start} is impossible: the episode of {folder} ends at step {length}.")
         at = {round(time) for time in np.linspace(start, length, frames)}
         return player.play(episode_seed, sampled, steps, at)
 
