@@ -112,9 +112,8 @@ def test_an_mp4_without_its_encoder_is_an_error_in_one_sentence(tmp_path, run, m
 
 
 def test_a_strip_is_evenly_spaced_from_the_first_timestep_to_the_last(run):
-    assert list(films._strip(restore_seed(run), 3, 0, False, None).frames) == [0, 2, 5]
-    assert list(films._strip(restore_seed(run), 8, 0, False, 3).frames) == [0, 1, 2, 3]
-    assert list(films._strip(restore_seed(run), 3, 0, False, None, 3).frames) == [3, 4, 5]
+    for frames, start, steps, expected in ((3, 0, None, [0, 2, 5]), (8, 0, 3, [0, 1, 2, 3]), (3, 3, None, [3, 4, 5])):
+        assert list(films._strip(run, restore_seed(run), frames, start, (0, False, steps)).frames) == expected
     ends = f"the episode of {run.folder} ends at step 5"
     for start, steps, sentence in (
         (5, None, ends),

@@ -265,28 +265,25 @@ class PredictiveSACAgent(ControllerAgent):
         """One update of the model; then a batch from the pool for each update of the controller."""
         key_targets, key_draw = jax.random.split(key)
         state, belief, metrics = self.learn_model(state, windows)
-        samples, likeness = self.samples(state, windows, belief, key_targets)
+        samples, more_metrics = self.samples(state, windows, belief, key_targets)
         found = pool.add(state.pool, samples)
         batches = pool.draw(found, key_draw, (self.cycle, self.batch_size))
         batches = batches._replace(belief=standardise(state.scales.belief, batches.belief))
-        return state._replace(pool=found), batches, metrics | {"likeness": likeness, "gamma": self.discount(state)}
-
-    def discount(self, state: State) -> Float[Array, ""]:
-        """γ. If rewards vary, each says how good its step was. If most are alike, the agent must look further ahead."""
-        found = jnp.where(state.scales.usual.is_flat, GAMMA_FLAT, GAMMA_VARIED)
-        return found if self.gamma is None else jnp.asarray(self.gamma, float)
+        return state._replace(pool=found), batches, metrics | more_metrics
 
     def samples(
         self, state: State, windows: Window, belief: Float[Array, "kept batch belief"], key: Key[Array, ""]
-    ) -> tuple[Samples, Float[Array, ""]]:
-        """The transitions of windows after the burn-in with their targets; and the mean of min(1, π / b)."""
+    ) -> tuple[Samples, Metrics]:
+        """The transitions of windows after the burn-in with their targets; also γ and the mean of min(1, π / b)."""
         after, valid = windows.between(self.burn_in, None), transitions(windows, self.burn_in)
-        belief_std = standardise(state.scales.belief, belief)
-        given = belief_std, after.step, valid, after.note.policy, key
-        discounts = self.discount(state), self.trace_decay, self.off_policy_trace
-        y, likeness = double_q.targets(state.controller, *given, *discounts)
+        s = standardise(state.scales.belief, belief)
+        # If rewards vary, each says how good its step was. If most are alike, the agent must look further ahead.
+        found = jnp.where(state.scales.usual.is_flat, GAMMA_FLAT, GAMMA_VARIED)
+        gamma = found if self.gamma is None else jnp.asarray(self.gamma, float)
+        discounts = gamma, self.trace_decay, self.off_policy_trace
+        y, likeness = double_q.targets(state.controller, s, after.step, valid, after.note.policy, key, *discounts)
         samples = Samples(belief[:-1], after.step.prev_action[1:], y, valid)
-        return samples, valid_mean(likeness.ravel(), valid.ravel())
+        return samples, {"likeness": valid_mean(likeness.ravel(), valid.ravel()), "gamma": gamma}
 
     def update(self, state: State, batch: Samples, key: Key[Array, ""]) -> tuple[State, Metrics]:
         controller, optimiser, metrics = double_q.update(

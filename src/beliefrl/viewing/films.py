@@ -254,30 +254,22 @@ def film(
     figures.paths(path)
     own = [agent if is_own(run.config["agent"]) else None for run in runs]
     rows = [
-        _strip(
-            restore_seed(run, seed, task, made_by, best), frames, episode_seed, sampled, steps, start, str(run.folder)
-        )
+        _strip(run, restore_seed(run, seed, task, made_by, best), frames, start, (episode_seed, sampled, steps))
         for run, made_by in zip(runs, own, strict=True)
     ]
     return figures.save(_draw_strips(runs, rows), path)
 
 
 def _strip(
-    restored: tuple[Agent, Any, Any, str],
-    frames: int,
-    episode_seed: int,
-    sampled: bool,
-    steps: int | None,
-    start: int = 0,
-    folder: str = "the run",
+    run: Run, restored: tuple[Agent, Any, Any, str], frames: int, start: int, episode: tuple[int, bool, int | None]
 ) -> Trajectory:
-    """An episode with evenly spaced frames. It is played twice, since the first time gives its length."""
+    """An `episode` (seed, sampled, steps) with evenly spaced frames; played twice, first to find its length."""
     with Player(*restored, rendered=True) as player:
-        length = len(player.play(episode_seed, sampled, steps).steps.reward) - 1
+        length = len(player.play(*episode).steps.reward) - 1
         if start >= length:
-            raise UserError(f"start={start} is impossible: the episode of {folder} ends at step {length}.")
+            raise UserError(f"start={start} is impossible: the episode of {run.folder} ends at step {length}.")
         at = {round(time) for time in np.linspace(start, length, frames)}
-        return player.play(episode_seed, sampled, steps, at)
+        return player.play(*episode, at)
 
 
 def _draw_strips(runs: Sequence[Run], rows: Sequence[Trajectory]) -> Any:
