@@ -48,7 +48,7 @@ def noted(window, excess=lambda reward: reward):
 
 def usual(state, reward, deviation):
     """The state after a pre-training on rewards with this median and this mean deviation."""
-    return state._replace(scales=state.scales._replace(usual=Usual(*map(jnp.array, (reward, deviation, 1.0, 1.0)))))
+    return state._replace(scales=state.scales._replace(usual=Usual(*map(jnp.array, (reward, deviation, 1.0)))))
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +108,7 @@ def test_pretraining_learns_which_rewards_are_usual_and_what_follows_does_not_ch
     window = noted(windows(jax.random.key(1), 2, TIME))
     window = window._replace(step=window.step._replace(reward=rewards))
     trained, _ = jax.jit(AGENT.pretrain)(state, window, jax.random.key(2))
-    np.testing.assert_allclose(trained.scales.usual, (1.0, 10 / 20, 18 / 20, 1.0), rtol=1e-6)
+    np.testing.assert_allclose(trained.scales.usual, (1.0, 10 / 20, 1.0), rtol=1e-6)
     np.testing.assert_allclose(trained.scales.usual.excess(jnp.array(3.5)), 0.0)  # five deviations
     np.testing.assert_allclose(trained.scales.usual.excess(jnp.array(3.6)), 2.6)
     np.testing.assert_allclose(trained.scales.usual.excess(jnp.array(-3.0)), -4.0)
@@ -116,39 +116,22 @@ def test_pretraining_learns_which_rewards_are_usual_and_what_follows_does_not_ch
     assert same(later.scales.usual, trained.scales.usual)
 
 
-@pytest.mark.parametrize(
-    ("rewards", "gamma"),
-    [
-        (jnp.ones((TIME, 2)), 0.995),
-        (jnp.zeros((TIME, 2)).at[3, 0].set(100.0), 0.995),  # sparse
-        (jnp.linspace(-0.1, 0.1, 2 * TIME).reshape(TIME, 2).at[3, 0].set(100.0), 0.995),  # sparse, with small costs
-        (jnp.linspace(-0.1, 0.1, 2 * TIME).reshape(TIME, 2), 0.97),
-        (1.0 + jax.random.normal(jax.random.key(3), (TIME, 2)), 0.97),
-        (jnp.where(jnp.arange(2 * TIME) < 2 * TIME * 0.65, 0.0, jnp.arange(2.0 * TIME)).reshape(TIME, 2), 0.995),
-        (jnp.where(jnp.arange(2 * TIME) < 2 * TIME * 0.4, 7.0, jnp.arange(2.0 * TIME)).reshape(TIME, 2), 0.97),
-        (jnp.tile(jnp.array([-1.0, -0.2, 0.0, 0.2, 1.0]), 5)[: 2 * TIME].reshape(TIME, 2), 0.97),  # 0.4 δ is not alike
-    ],
-)
-def test_the_discount_depends_on_whether_most_rewards_are_alike(state, begun, rewards, gamma):
-    """The targets of the critics have the discount that the pre-training has found, or the one that is given."""
-    window = begun[2]
-    window = window._replace(step=window.step._replace(reward=rewards))
-    trained, _ = jax.jit(AGENT.pretrain)(state, window, jax.random.key(2))
-    given = dataclasses.replace(AGENT, gamma=gamma)
-    found, chosen = (jax.jit(agent.begin_cycle)(trained, window, jax.random.key(3)) for agent in (AGENT, given))
-    assert found[2]["gamma"] == chosen[2]["gamma"] == np.float32(gamma)
-    assert same(found[0].pool, chosen[0].pool)
-    other = jax.jit(dataclasses.replace(AGENT, gamma=0.5).begin_cycle)(trained, window, jax.random.key(3))
-    assert not same(found[0].pool, other[0].pool)
+def test_the_targets_have_the_discount_of_the_agent(begun):
+    trained, _, window = begun
+    other = dataclasses.replace(AGENT, gamma=0.5)
+    plain, same_gamma, half = (
+        jax.jit(agent.begin_cycle)(trained, window, jax.random.key(3))[0].pool
+        for agent in (AGENT, dataclasses.replace(AGENT, gamma=0.99), other)
+    )
+    assert same(plain, same_gamma)
+    assert not same(plain, half)
 
 
 def test_usual_rewards_are_averages_over_the_batches():
-    before, valid = Usual(*jnp.zeros(4)), jnp.ones(4, bool)
-    assert before.is_flat
+    before, valid = Usual(*jnp.zeros(3)), jnp.ones(4, bool)
     for rewards in ([0.0, 0.0, 0.0, 8.0], [1.0, 2.0, 4.0, 5.0]):
         before = before.include(jnp.array(rewards), valid)
-    np.testing.assert_allclose(before, ((0 + 3) / 2, (2 + 1.5) / 2, (3 / 4 + 0) / 2, 2), rtol=1e-6)
-    assert not before.is_flat
+    np.testing.assert_allclose(before, ((0 + 3) / 2, (2 + 1.5) / 2, 2), rtol=1e-6)
     none = before.include(jnp.array([9.0, 9.0, 9.0, 9.0]), ~valid)
     assert same(none, before)
 
@@ -199,7 +182,7 @@ def test_targets_in_the_pool_are_those_of_the_window(state, begun):
     y, valid = (np.asarray(leaf[0]).reshape(6, 2) for leaf in after.pool.transitions[2:])
     np.testing.assert_array_equal(valid, ~step.is_first[1:])
     for t in reversed(range(6)):
-        expected = step.reward[t + 1] + 0.995 * np.where(step.terminated[t + 1], 0.0, expected)
+        expected = step.reward[t + 1] + agent.gamma * np.where(step.terminated[t + 1], 0.0, expected)
         np.testing.assert_allclose(y[t][valid[t]], expected[valid[t]], rtol=1e-4, atol=1e-5)
         expected = np.where(valid[t], expected, 0.0)
 
@@ -214,7 +197,7 @@ def test_traces_use_the_policy_noted_at_their_timestep(state, begun):
     _, belief, _ = jax.jit(agent.learn_model)(state, window)
     late, step = (jax.tree.map(lambda leaf: leaf[4:], tree) for tree in (policy, window.step))
     valid, key = jnp.ones((6, 2), bool), jax.random.split(key)[0]
-    given = standardise(after.scales.belief, belief), step, valid, late, key, 0.995, 0.8, 0.0
+    given = standardise(after.scales.belief, belief), step, valid, late, key, agent.gamma, 0.8, 0.0
     y, _ = jax.jit(lambda: double_q.targets(state.controller, *given))()
     np.testing.assert_allclose(after.pool.transitions.target[0], y.ravel(), rtol=1e-4, atol=1e-5)
 
@@ -299,7 +282,6 @@ def test_what_does_not_exist_changes_nothing(state):
     ("field", "value"),
     [
         ("pool", 0),
-        ("gamma", 1.5),
         ("long_memories", 1.5),
         ("trace_decay", 1.5),
         ("off_policy_trace", -0.1),

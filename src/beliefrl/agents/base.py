@@ -34,6 +34,8 @@ Metrics = dict[str, Float[Array, ""]]
 class ControllerAgent:
     """Base class of agents whose controller is a soft actor-critic: its hyperparameters and its actions."""
 
+    gamma: float = 0.99
+    """Discount factor γ, in [0, 1] (Table 1)."""
     step_start_rl: int = 1000
     """Environment steps before training starts; the untrained policy acts until then (Table 1)."""
     train_interval_rl: int = 1
@@ -56,6 +58,7 @@ class ControllerAgent:
     """Weight of half the mean squares of the policy's μ and σ in the actor's loss (the authors' code; 0 is off)."""
 
     ranges = {  # for `beliefrl.tune`
+        "gamma": Range(0.95, 0.999, "horizon"),
         "lr_actor": Range(1e-4, 3e-3, "log"),
         "lr_critic": Range(1e-4, 3e-3, "log"),
         "lr_alpha": Range(1e-4, 3e-3, "log"),
@@ -70,7 +73,7 @@ class ControllerAgent:
         check_range(self, ("policy_layers", "value_layers"), 1, WIDEST)
         check_range(self, ("actor_regulariser",), 0)
         check_range(self, ("step_start_rl",), 2)  # fewer timesteps hold no transition
-        check_range(self, ("lr_actor", "lr_critic", "lr_alpha", "tau"), 0, 1)
+        check_range(self, ("lr_actor", "lr_critic", "lr_alpha", "gamma", "tau"), 0, 1)
         if self.target_entropy is not None:
             check_range(self, ("target_entropy",), -LARGEST)
         for field in dataclasses.fields(self):
@@ -117,8 +120,6 @@ class ControllerAgent:
 class SACAgent(ControllerAgent):
     """Base class of the paper's agents, whose controller has a V (Table 1)."""
 
-    gamma: float = 0.99
-    """Discount factor γ, in [0, 1] (Table 1)."""
     n_step: int = 1
     """Steps of the critics' n-step returns (the paper: one). More propagate rewards faster over a long horizon."""
     updates_per_step: int = 1
@@ -127,16 +128,11 @@ class SACAgent(ControllerAgent):
     value_start: float = 0.0
     """Initial output of V and Q, up to noise from the initial weights (the paper: 0), in units of the return."""
 
-    ranges = ControllerAgent.ranges | {
-        "gamma": Range(0.95, 0.999, "horizon"),
-        "n_step": (1, 3, 5, 10),
-        "updates_per_step": (1, 2, 4),
-    }
+    ranges = ControllerAgent.ranges | {"n_step": (1, 3, 5, 10), "updates_per_step": (1, 2, 4)}
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
         super().__post_init__()
-        check_range(self, ("gamma",), 0, 1)
         check_range(self, ("n_step",), 1, MOST_STEPS)
         check_range(self, ("updates_per_step",), 1)
         check_range(self, ("value_start",), -LARGEST)

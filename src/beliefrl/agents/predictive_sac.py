@@ -37,9 +37,6 @@ from beliefrl.models.scales import Scales, initial_scales
 from beliefrl.models.soft_actor_critic import OptimiserState, valid_mean
 from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range, transitions
 
-GAMMA_FLAT = 0.995  # γ if most rewards of the exploration are alike
-GAMMA_VARIED = 0.97  # γ if they vary from step to step
-
 
 class Note(NamedTuple):
     """What the replay stores with a timestep.
@@ -75,9 +72,6 @@ class PredictiveSACAgent(ControllerAgent):
     """Soft actor-critic on an LSTM that learns only to predict observations and rewards. It is not in the paper."""
 
     # The controller
-    gamma: float | None = None
-    """Discount factor γ, in [0, 1]. None: it depends on the rewards of the exploration. If most of them are alike, or
-    if there is no pre-training, it is 0.995, and else 0.97. With `--init-from` it is that of the other run."""
     trace_decay: float = 0.95
     """λ of the λ-returns from which the critics learn, in [0, 1]. With 0, a target has one reward and the value
     of the next belief."""
@@ -112,7 +106,7 @@ class PredictiveSACAgent(ControllerAgent):
     """Adam's learning rate for the model."""
     seq_len: int = 32
     """Steps in a sampled sequence."""
-    sequences: int = 8
+    sequences: int = 4
     """Sequences in an update of the model."""
     burn_in: int = 32
     """Burn-in: at most this many steps before a sequence initialise its state, from zero."""
@@ -127,14 +121,13 @@ class PredictiveSACAgent(ControllerAgent):
     reward_memory: tuple[float, ...] = (8.0, 64.0, 512.0)
     """Time constants, in steps, of the memory of unusual rewards that the LSTM reads. The pre-training determines which
     rewards are unusual."""
-    pool: int = 8
+    pool: int = 16
     """Number of the last cycles whose transitions are in the pool."""
     average_rate: float = 2e-3
     """Rate of the running average of the weights that is evaluated and saved, in (0, 1]. With 1, the newest weights are
     evaluated."""
 
     ranges = ControllerAgent.ranges | {
-        "gamma": (None, 0.95, 0.98, 0.99, 0.998),
         "batch_size": (64, 128, 256, 512),
         "trace_decay": Range(0.8, 1.0),
         "tau": Range(5e-3, 5e-2, "log"),
@@ -142,7 +135,7 @@ class PredictiveSACAgent(ControllerAgent):
         "seq_len": (16, 32, 64),
         "d_size": (64, 128, 256),
         "long_memories": Range(0.0, 0.5),
-        "pool": (4, 8, 16),
+        "pool": (8, 16, 32),
     }
 
     def __post_init__(self) -> None:
@@ -152,8 +145,6 @@ class PredictiveSACAgent(ControllerAgent):
         check_range(self, ("d_size", "hidden_size"), 1, WIDEST)
         check_range(self, ("burn_in", "pretrain_updates"), 0)
         check_range(self, ("alpha_start",), 1e-6)
-        if self.gamma is not None:
-            check_range(self, ("gamma",), 0, 1)
         check_range(self, ("lr_model", "long_memories", "trace_decay", "off_policy_trace"), 0, 1)
         check_range(self, ("average_rate",), 1e-6, 1)
         check_range(self, ("reward_memory",), 1)
@@ -274,16 +265,13 @@ class PredictiveSACAgent(ControllerAgent):
     def samples(
         self, state: State, windows: Window, belief: Float[Array, "kept batch belief"], key: Key[Array, ""]
     ) -> tuple[Samples, Metrics]:
-        """The transitions of windows after the burn-in with their targets; also γ and the mean of min(1, π / b)."""
+        """The transitions of windows after the burn-in with their targets; also the mean of min(1, π / b)."""
         after, valid = windows.between(self.burn_in, None), transitions(windows, self.burn_in)
         s = standardise(state.scales.belief, belief)
-        # If rewards vary, each says how good its step was. If most are alike, the agent must look further ahead.
-        found = jnp.where(state.scales.usual.is_flat, GAMMA_FLAT, GAMMA_VARIED)
-        gamma = found if self.gamma is None else jnp.asarray(self.gamma, float)
-        discounts = gamma, self.trace_decay, self.off_policy_trace
+        discounts = self.gamma, self.trace_decay, self.off_policy_trace
         y, likeness = double_q.targets(state.controller, s, after.step, valid, after.note.policy, key, *discounts)
         samples = Samples(belief[:-1], after.step.prev_action[1:], y, valid)
-        return samples, {"likeness": valid_mean(likeness.ravel(), valid.ravel()), "gamma": gamma}
+        return samples, {"likeness": valid_mean(likeness.ravel(), valid.ravel())}
 
     def update(self, state: State, batch: Samples, key: Key[Array, ""]) -> tuple[State, Metrics]:
         controller, optimiser, metrics = double_q.update(

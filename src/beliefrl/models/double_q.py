@@ -147,7 +147,7 @@ def targets(
     valid: Bool[Array, "length batch"],
     behaviour: Policy,
     key: Key[Array, ""],
-    gamma: Float[Array, ""] | float,
+    gamma: float,
     decay: float,
     off_policy: float,
 ) -> tuple[Float[Array, "length batch"], Float[Array, "length batch"]]:

@@ -30,7 +30,6 @@ from jaxtyping import Array, Bool, Float, Key
 from beliefrl.models.nets import LSTM, MLP, LSTMState, draw
 from beliefrl.models.soft_actor_critic import valid_mean
 
-ALIKE = 0.1  # mean absolute deviations from the median within which rewards are alike
 UNUSUAL = 5  # mean absolute deviations from the median at which a reward is unusual
 
 
@@ -67,11 +66,10 @@ class PredictiveModel(eqx.Module):
 
 
 class Usual(NamedTuple):
-    """Which rewards are usual; the first three numbers are averages over the batches of the pre-training."""
+    """Which rewards are usual; both numbers are averages over the batches of the pre-training."""
 
     reward: Float[Array, ""]  # r̄, the median of a batch
     deviation: Float[Array, ""]  # δ, the mean distance to it
-    alike: Float[Array, ""]  # fraction of rewards within δ / 10 of it
     batches: Float[Array, ""]  # so far; without any, all rewards are usual
 
     def include(self, reward: Float[Array, "*batch"], valid: Bool[Array, "*batch"]) -> "Usual":
@@ -79,16 +77,9 @@ class Usual(NamedTuple):
         batches = self.batches + jnp.any(valid)
         rate = jnp.any(valid) / jnp.maximum(batches, 1)
         median = jnp.nan_to_num(jnp.nanmedian(jnp.where(valid, reward, jnp.nan)))
-        distance, valid = jnp.abs(reward - median).ravel(), valid.ravel()
-        deviation = valid_mean(distance, valid)
-        alike = valid_mean(1.0 * (distance <= ALIKE * deviation), valid)
-        new = Usual(median, deviation, alike, batches)
-        return jax.tree.map(lambda old, new: old + rate * (new - old), self, new)._replace(batches=batches)
-
-    @property
-    def is_flat(self) -> Bool[Array, ""]:
-        """Whether most rewards are alike: they are constant, or other rewards are rare."""
-        return (self.batches == 0) | (self.alike > 0.5)
+        deviation = valid_mean(jnp.abs(reward - median).ravel(), valid.ravel())
+        usual = self.reward + rate * (median - self.reward), self.deviation + rate * (deviation - self.deviation)
+        return Usual(*usual, batches)
 
     def excess(self, reward: Float[Array, ""]) -> Float[Array, ""]:
         """u(r)."""

@@ -91,7 +91,7 @@ def lambda_returns(
     valid: Bool[Array, "length batch"],
     value: Float[Array, "time batch"],
     trace: Float[Array, "length batch"],
-    gamma: Float[Array, ""] | float,
+    gamma: float,
 ) -> Float[Array, "length batch"]:
     """y_t of `length` transitions between length + 1 timesteps.
 

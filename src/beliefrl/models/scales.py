@@ -16,7 +16,7 @@ class Scales(NamedTuple):
     obs: RunningStatistics
     reward: RunningStatistics
     belief: RunningStatistics
-    usual: Usual  # from the pre-training
+    usual: Usual  # r̄ and δ, from the pre-training
 
     def include(self, windows: Window) -> "Scales":
         """With the observations and rewards of one more batch."""
@@ -50,4 +50,4 @@ class Scales(NamedTuple):
 def initial_scales(obs: int, belief: int) -> Scales:
     """The statistics before any batch, given the sizes of observations and beliefs."""
     of_obs, of_reward, of_belief = map(initial_statistics, (obs, 1, belief))
-    return Scales(of_obs, of_reward, of_belief, Usual(*jnp.zeros(4)))
+    return Scales(of_obs, of_reward, of_belief, Usual(*jnp.zeros(3)))
