@@ -106,7 +106,7 @@ class PredictiveSACAgent(ControllerAgent):
     """Adam's learning rate for the model."""
     seq_len: int = 32
     """Steps in a sampled sequence."""
-    sequences: int = 4
+    sequences: int = 8
     """Sequences in an update of the model."""
     burn_in: int = 32
     """Burn-in: at most this many steps before a sequence initialise its state, from zero."""
@@ -121,7 +121,7 @@ class PredictiveSACAgent(ControllerAgent):
     reward_memory: tuple[float, ...] = (8.0, 64.0, 512.0)
     """Time constants, in steps, of the memory of unusual rewards that the LSTM reads. The pre-training determines which
     rewards are unusual."""
-    pool: int = 16
+    pool: int = 8
     """Number of the last cycles whose transitions are in the pool."""
     average_rate: float = 2e-3
     """Rate of the running average of the weights that is evaluated and saved, in (0, 1]. With 1, the newest weights are
@@ -135,7 +135,7 @@ class PredictiveSACAgent(ControllerAgent):
         "seq_len": (16, 32, 64),
         "d_size": (64, 128, 256),
         "long_memories": Range(0.0, 0.5),
-        "pool": (8, 16, 32),
+        "pool": (4, 8, 16),
     }
 
     def __post_init__(self) -> None:
