@@ -174,7 +174,7 @@ def test_targets_in_the_pool_are_those_of_the_window(state, begun):
     first = window.step.is_first.at[7, 0].set(True)
     terminated = window.step.terminated.at[6, 0].set(True).at[8, 1].set(True)
     window = window._replace(step=window.step._replace(is_first=first, terminated=terminated))
-    agent = dataclasses.replace(AGENT, trace_decay=1.0, off_policy_trace=1.0)
+    agent = dataclasses.replace(AGENT, gamma=0.9, trace_decay=1.0, off_policy_trace=1.0)
     zero = jax.tree.map(jnp.zeros_like, state.controller.targets)
     valueless = state._replace(controller=state.controller._replace(targets=zero))
     after, _, _ = jax.jit(agent.begin_cycle)(valueless, window, jax.random.key(2))
@@ -281,6 +281,7 @@ def test_what_does_not_exist_changes_nothing(state):
 @pytest.mark.parametrize(
     ("field", "value"),
     [
+        ("gamma", 1.5),
         ("pool", 0),
         ("long_memories", 1.5),
         ("trace_decay", 1.5),

@@ -66,7 +66,7 @@ class PredictiveModel(eqx.Module):
 
 
 class Usual(NamedTuple):
-    """Which rewards are usual; both numbers are averages over the batches of the pre-training."""
+    """Which rewards are usual; the first two numbers are averages over the batches of the pre-training."""
 
     reward: Float[Array, ""]  # r̄, the median of a batch
     deviation: Float[Array, ""]  # δ, the mean distance to it
