@@ -256,22 +256,22 @@ class PredictiveSACAgent(ControllerAgent):
         """One update of the model; then a batch from the pool for each update of the controller."""
         key_targets, key_draw = jax.random.split(key)
         state, belief, metrics = self.learn_model(state, windows)
-        samples, more_metrics = self.samples(state, windows, belief, key_targets)
+        samples, likeness = self.samples(state, windows, belief, key_targets)
         found = pool.add(state.pool, samples)
         batches = pool.draw(found, key_draw, (self.cycle, self.batch_size))
         batches = batches._replace(belief=standardise(state.scales.belief, batches.belief))
-        return state._replace(pool=found), batches, metrics | more_metrics
+        return state._replace(pool=found), batches, metrics | {"likeness": likeness}
 
     def samples(
         self, state: State, windows: Window, belief: Float[Array, "kept batch belief"], key: Key[Array, ""]
-    ) -> tuple[Samples, Metrics]:
+    ) -> tuple[Samples, Float[Array, ""]]:
         """The transitions of windows after the burn-in with their targets; also the mean of min(1, π / b)."""
         after, valid = windows.between(self.burn_in, None), transitions(windows, self.burn_in)
         s = standardise(state.scales.belief, belief)
         discounts = self.gamma, self.trace_decay, self.off_policy_trace
         y, likeness = double_q.targets(state.controller, s, after.step, valid, after.note.policy, key, *discounts)
         samples = Samples(belief[:-1], after.step.prev_action[1:], y, valid)
-        return samples, {"likeness": valid_mean(likeness.ravel(), valid.ravel())}
+        return samples, valid_mean(likeness.ravel(), valid.ravel())
 
     def update(self, state: State, batch: Samples, key: Key[Array, ""]) -> tuple[State, Metrics]:
         controller, optimiser, metrics = double_q.update(
