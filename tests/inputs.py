@@ -57,7 +57,7 @@ def differ(a, b):
 def changed_where_missing(agent, state, window, exists):
     """What a cycle and its updates make of windows, and of the same with other timesteps where none exist."""
     other = windows(jax.random.key(9), *exists.shape)
-    other = other._replace(note=jax.tree.map(lambda leaf: leaf + 1.0, window.note))
+    other = other._replace(note=jax.tree.map(lambda leaf: leaf + 1.0, window.note), reading=window.reading)
     exists = exists.T
     changed = jax.tree.map(
         lambda a, b: jnp.where(exists.reshape(exists.shape + (1,) * (a.ndim - 2)), a, b),

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from beliefrl.errors import UserError as UserError
 from beliefrl.errors import cause as cause
@@ -137,23 +137,41 @@ class StoredTimestep(NamedTuple):
     note: Any
 
 
+class Reading(NamedTuple):
+    """Which readers have read the windows of a batch."""
+
+    reader: Int[Array, " batch"]  # their indices
+    continues: Bool[Array, " batch"]  # the window begins with the last timestep of the reader's window before
+
+
 class Window(NamedTuple):
-    """Windows of consecutive timesteps from the replay. is_first is also set at the oldest stored timestep."""
+    """Windows of consecutive timesteps from the replay.
+
+    In windows that are drawn at random, is_first is also set at the oldest stored timestep.
+    """
 
     step: Timestep  # leaves (time, batch, ...)
     note: Any
     exists: Bool[Array, " time *batch"]  # False outside of the stored timesteps
+    reading: Reading | None = None  # if the windows are read in order
 
     def between(self, start: int, stop: int | None) -> "Window":
         """The timesteps from `start` to `stop`, as in a slice."""
-        return jax.tree.map(lambda leaf: leaf[start:stop], self)
+        step, note, exists = jax.tree.map(lambda leaf: leaf[start:stop], self[:3])
+        return Window(step, note, exists, self.reading)
 
 
 class WindowShape(NamedTuple):
-    """The length of a window: `burn_in` timesteps, then `length` transitions, so burn_in + length + 1 timesteps."""
+    """The windows of an agent: `burn_in` timesteps, then `length` transitions, so burn_in + length + 1 timesteps.
+
+    Without readers, windows are drawn at random. With readers they are read in order and have no burn-in: at each turn
+    a reader reads the window that follows its last one, or it first jumps to a random place.
+    """
 
     burn_in: int
     length: int
+    readers: int = 0
+    jump: float = 0.0  # probability that a reader jumps before it reads
 
 
 def transitions(window: Window, burn_in: int) -> Bool[Array, " length *batch"]:

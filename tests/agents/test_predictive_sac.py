@@ -13,7 +13,7 @@ from beliefrl.models.double_q import Policy
 from beliefrl.models.nets import standardise
 from beliefrl.models.pool import draw
 from beliefrl.models.predictive_model import Usual, init_model, prediction_loss, remember
-from beliefrl.types import UserError
+from beliefrl.types import Reading, UserError
 from inputs import SPEC, changed_where_missing, same, windows
 
 AGENT = PredictiveSACAgent(
@@ -23,18 +23,17 @@ AGENT = PredictiveSACAgent(
     hidden_size=8,
     seq_len=6,
     sequences=2,
-    burn_in=4,
     batch_size=16,
     pool=3,
     reward_memory=(2.0, 10.0),
 )
-TIME, COUNT = 11, 12  # timesteps of a window, transitions of a cycle
+TIME = 7  # timesteps of a window
 
 
 def noted(window, excess=lambda reward: reward):
-    """The window with the notes of an actor that began with an empty memory; `excess` is u.
+    """The window, read by the first readers after a jump, with the notes of an actor whose memory was empty.
 
-    The policy that acted is a standard normal before the tanh.
+    `excess` is u. The policy that acted is a standard normal before the tanh.
     """
     before, notes = jnp.zeros((window.step.reward.shape[1], 2)), []
     for t in range(len(window.step.reward)):
@@ -43,7 +42,21 @@ def noted(window, excess=lambda reward: reward):
         before = before * (1 - 1 / jnp.array([[2.0, 10.0]])) + u
         notes.append(before)
     zeros = jnp.zeros_like(window.step.prev_action)
-    return window._replace(note=Note(jnp.stack(notes), Policy(zeros, zeros)))
+    return read(window._replace(note=Note(jnp.stack(notes), Policy(zeros, zeros))), continues=False)
+
+
+def read(window, continues, reader=None):
+    """The window as read by these readers, the first ones by default."""
+    batch = window.step.reward.shape[1]
+    reader = jnp.arange(batch) if reader is None else jnp.array(reader)
+    return window._replace(reading=Reading(reader, jnp.broadcast_to(jnp.array(continues), (batch,))))
+
+
+def unrolled(state, window, start=None):
+    """The LSTM's states along a window, from zero by default."""
+    inputs = state.scales.model_input(state.scales.perception(window.step), window.note.rewards)
+    start = state.model.lstm.start(window.step.reward.shape[1]) if start is None else start
+    return jax.jit(lambda: state.model.lstm.unroll(start, inputs, window.step.is_first))()
 
 
 def usual(state, reward, deviation):
@@ -64,21 +77,50 @@ def begun(state):
 
 
 def test_acting_forms_the_belief_that_replay_forms(state):
-    first = jnp.zeros((1, TIME), bool).at[0, jnp.array([0, 5])].set(True)
+    first = jnp.zeros((1, TIME), bool).at[0, jnp.array([0, 3])].set(True)
     state = usual(state, 0.3, 0.1)
     window = windows(jax.random.key(1), 1, TIME, first)
     window = noted(window, lambda r: jnp.where(jnp.abs(r - 0.3) > 0.5, r - 0.3, 0.0))
-    step = window.step
-    inputs = state.scales.model_input(state.scales.perception(step), window.note.rewards)
-    at_once = jax.jit(lambda: state.model.unroll(inputs, step.is_first, 4))()
+    step, at_once = window.step, unrolled(state, window)
     memory, act = AGENT.reset(SPEC), jax.jit(AGENT.act)
     for t in range(TIME):
         now = jax.tree.map(lambda leaf, t=t: leaf[t, 0], step)
         memory = AGENT.reset(SPEC) if now.is_first else memory
         _, memory = act(state, memory, now, jax.random.key(t), jnp.array(False))
         np.testing.assert_allclose(AGENT.note(memory).rewards, window.note.rewards[t, 0], rtol=1e-5, atol=1e-6)
-        if t >= 4:
-            np.testing.assert_allclose(memory.lstm.d, at_once[t - 4, 0], rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(memory.lstm.d, at_once.d[t, 0], rtol=1e-5, atol=1e-6)
+
+
+def test_a_window_that_continues_starts_from_the_state_at_the_end_of_the_last_one(state):
+    """The last timestep of a window is the first of the next one; the other readers keep their states."""
+    whole, learn, reader = noted(windows(jax.random.key(1), 2, 2 * TIME - 1)), jax.jit(AGENT.learn_model), (3, 1)
+    one = read(whole.between(0, TIME), False, reader)
+    two = read(whole.between(TIME - 1, None), True, reader)
+    first, _, _ = learn(state, one)
+    second, beliefs, _ = learn(first, two)
+    before = jax.tree.map(lambda leaf: leaf[-2], unrolled(state._replace(scales=first.scales), one))
+    kept = jax.tree.map(lambda leaf: leaf[jnp.array(reader)], first.readers)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), before, kept)
+    np.testing.assert_array_equal(first.readers.d[jnp.array([0, 2, 4, 5])], 0.0)
+    d = unrolled(first._replace(scales=second.scales), two, kept).d
+    np.testing.assert_allclose(beliefs.belief[..., : AGENT.d_size], d, rtol=1e-5, atol=1e-6)
+    assert beliefs.valid.all()
+
+
+def test_after_a_jump_nothing_is_learned_until_an_episode_begins(state):
+    first = jnp.zeros((2, TIME), bool).at[0, 3].set(True)
+    window = noted(windows(jax.random.key(1), 2, TIME, first))
+    full = state._replace(readers=jax.tree.map(jnp.ones_like, state.readers))
+    after, beliefs, metrics = jax.jit(AGENT.learn_model)(full, window)
+    np.testing.assert_array_equal(beliefs.valid, [[t >= 3, False] for t in range(TIME - 1)])
+    d = unrolled(state._replace(scales=after.scales), window).d  # from zero
+    np.testing.assert_allclose(beliefs.belief[..., : AGENT.d_size], d, rtol=1e-5, atol=1e-6)
+    obs = window.step.obs.at[:3, 0].add(5.0).at[1:, 1].add(5.0)  # what is not learned from
+    scaled = window._replace(step=window.step._replace(obs=obs))
+    same_scales = full._replace(scales=full.scales._replace(obs=full.scales.obs._replace(batches=jnp.array(1e9))))
+    losses = [jax.jit(AGENT.learn_model)(same_scales, each)[2]["loss_model"] for each in (window, scaled)]
+    assert metrics["loss_model"] > 0
+    np.testing.assert_allclose(*losses, rtol=2e-2)
 
 
 def test_a_belief_in_the_replay_remembers_rewards_from_before_its_window(state):
@@ -86,7 +128,7 @@ def test_a_belief_in_the_replay_remembers_rewards_from_before_its_window(state):
     rewards = window.note.rewards.at[:, 0].add(1.0)  # a reward before the window
     long_ago = window._replace(note=window.note._replace(rewards=rewards))
     learn = jax.jit(AGENT.learn_model)
-    plain, other = learn(state, window)[1], learn(state, long_ago)[1]
+    plain, other = learn(state, window)[1].belief, learn(state, long_ago)[1].belief
     d = AGENT.d_size
     assert (jnp.abs(plain - other)[:, 0, :d].max(axis=-1) > 1e-4).all()
     np.testing.assert_allclose(plain[..., d:], other[..., d:], rtol=1e-5)  # x_t has no memory
@@ -108,10 +150,10 @@ def test_pretraining_learns_which_rewards_are_usual_and_what_follows_does_not_ch
     window = noted(windows(jax.random.key(1), 2, TIME))
     window = window._replace(step=window.step._replace(reward=rewards))
     trained, _ = jax.jit(AGENT.pretrain)(state, window, jax.random.key(2))
-    np.testing.assert_allclose(trained.scales.usual, (1.0, 10 / 20, 1.0), rtol=1e-6)
-    np.testing.assert_allclose(trained.scales.usual.excess(jnp.array(3.5)), 0.0)  # five deviations
-    np.testing.assert_allclose(trained.scales.usual.excess(jnp.array(3.6)), 2.6)
-    np.testing.assert_allclose(trained.scales.usual.excess(jnp.array(-3.0)), -4.0)
+    np.testing.assert_allclose(trained.scales.usual, (1.0, 10 / 12, 1.0), rtol=1e-6)
+    np.testing.assert_allclose(trained.scales.usual.excess(jnp.array(5.1)), 0.0)  # five deviations
+    np.testing.assert_allclose(trained.scales.usual.excess(jnp.array(5.2)), 4.2, rtol=1e-6)
+    np.testing.assert_allclose(trained.scales.usual.excess(jnp.array(-3.2)), -4.2, rtol=1e-6)
     later, _, _ = jax.jit(AGENT.begin_cycle)(trained, window, jax.random.key(3))
     assert same(later.scales.usual, trained.scales.usual)
 
@@ -160,25 +202,24 @@ def test_transitions_in_the_pool_are_aligned_in_time(state, begun):
     after, _, window = begun
     pool, step = jax.tree.map(lambda leaf: leaf[0], after.pool.transitions), window.step
     x = after.scales.perception(step)  # the scales of this cycle, the model before its update
-    inputs = after.scales.model_input(x, window.note.rewards)
-    belief = jnp.concatenate([state.model.unroll(inputs, step.is_first, 4), x[4:]], axis=-1)
+    belief = jnp.concatenate([unrolled(state._replace(scales=after.scales), window).d, x], axis=-1)
     for t, sequence in ((0, 0), (2, 1), (5, 1)):
-        row, now = 2 * t + sequence, 4 + t
+        row = 2 * t + sequence
         np.testing.assert_allclose(pool.belief[row], belief[t, sequence], rtol=1e-4, atol=1e-5)
-        np.testing.assert_array_equal(pool.action[row], step.prev_action[now + 1, sequence])
+        np.testing.assert_array_equal(pool.action[row], step.prev_action[t + 1, sequence])
 
 
 def test_targets_in_the_pool_are_those_of_the_window(state, begun):
     """With λ = 1, ω = 1 and V̄ = 0 a target has the rewards until the end of the episode or of the window."""
     _, _, window = begun
-    first = window.step.is_first.at[7, 0].set(True)
-    terminated = window.step.terminated.at[6, 0].set(True).at[8, 1].set(True)
+    first = window.step.is_first.at[3, 0].set(True)
+    terminated = window.step.terminated.at[2, 0].set(True).at[4, 1].set(True)
     window = window._replace(step=window.step._replace(is_first=first, terminated=terminated))
     agent = dataclasses.replace(AGENT, gamma=0.9, trace_decay=1.0, off_policy_trace=1.0)
     zero = jax.tree.map(jnp.zeros_like, state.controller.targets)
     valueless = state._replace(controller=state.controller._replace(targets=zero))
     after, _, _ = jax.jit(agent.begin_cycle)(valueless, window, jax.random.key(2))
-    step, expected = jax.tree.map(lambda leaf: np.asarray(leaf[4:]), window.step), np.zeros(2)
+    step, expected = jax.tree.map(np.asarray, window.step), np.zeros(2)
     y, valid = (np.asarray(leaf[0]).reshape(6, 2) for leaf in after.pool.transitions[2:])
     np.testing.assert_array_equal(valid, ~step.is_first[1:])
     for t in reversed(range(6)):
@@ -194,10 +235,9 @@ def test_traces_use_the_policy_noted_at_their_timestep(state, begun):
     window = window._replace(note=window.note._replace(policy=policy))
     agent, key = dataclasses.replace(AGENT, trace_decay=0.8, off_policy_trace=0.0), jax.random.key(2)
     after, _, _ = jax.jit(agent.begin_cycle)(state, window, key)
-    _, belief, _ = jax.jit(agent.learn_model)(state, window)
-    late, step = (jax.tree.map(lambda leaf: leaf[4:], tree) for tree in (policy, window.step))
+    belief = jax.jit(agent.learn_model)(state, window)[1].belief
     valid, key = jnp.ones((6, 2), bool), jax.random.split(key)[0]
-    given = standardise(after.scales.belief, belief), step, valid, late, key, agent.gamma, 0.8, 0.0
+    given = standardise(after.scales.belief, belief), window.step, valid, policy, key, agent.gamma, 0.8, 0.0
     y, _ = jax.jit(lambda: double_q.targets(state.controller, *given))()
     np.testing.assert_allclose(after.pool.transitions.target[0], y.ravel(), rtol=1e-4, atol=1e-5)
 
@@ -269,8 +309,8 @@ def test_pretraining_teaches_the_model_to_predict(state):
 
 @pytest.mark.nightly
 def test_what_does_not_exist_changes_nothing(state):
-    exists = jnp.ones((2, TIME), bool).at[0, :3].set(False).at[1, -2:].set(False)
-    first = jnp.zeros((2, TIME), bool).at[0, 3].set(True).at[1, 0].set(True)  # as the replay marks the oldest timestep
+    exists = jnp.ones((2, TIME), bool).at[1, -2:].set(False)
+    first = jnp.zeros((2, TIME), bool).at[:, 0].set(True)
     window = noted(windows(jax.random.key(1), 2, TIME, first))
     results = changed_where_missing(AGENT, state, window, exists)
     (a, metrics_a), (b, metrics_b) = results
@@ -283,6 +323,7 @@ def test_what_does_not_exist_changes_nothing(state):
     [
         ("gamma", 1.5),
         ("pool", 0),
+        ("jump", 1.5),
         ("long_memories", 1.5),
         ("trace_decay", 1.5),
         ("off_policy_trace", -0.1),
@@ -295,7 +336,7 @@ def test_impossible_values_are_refused(field, value):
         PredictiveSACAgent(**{field: value})
 
 
-# A recurrent model that learns only to predict: its memories, its loss, and its burn-in.
+# A recurrent model that learns only to predict: its memories and its loss.
 
 OBS, ACTION, D = 3, 2, 8
 SIZES = OBS, ACTION, 2, D, 6

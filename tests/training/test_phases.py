@@ -24,7 +24,6 @@ SMALL = {
         "hidden_size": 8,
         "pretrain_updates": 10,
         "seq_len": 8,
-        "burn_in": 4,
         "sequences": 2,
     },
     "slac": {"z1_size": 2, "z2_size": 4, "model_layers": (8,), "batch_size": 2, "pretrain_updates": 10},

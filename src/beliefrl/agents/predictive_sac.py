@@ -9,9 +9,13 @@ This agent is not from the paper. It keeps the paper's idea: a recurrent model t
 belief, and a soft actor-critic acts on it. It differs from `vrm` in this: one model instead of two, without latent
 variables and without a frozen copy; standardised inputs; λ-returns; no V.
 
+The model reads the replay in order (`training.replay.Readers`): each reader keeps the LSTM's state at the end of its
+last window and continues from there. So the beliefs in training have as long a memory as those of the actor, and there
+is no burn-in. After a jump the state is empty: the first window only fills it, until an episode begins.
+
 One unroll of the windows of a cycle serves both: the model learns from it, and its beliefs become transitions. A pool
 has the transitions of the last `pool` cycles with their targets, and the controller's batches are drawn from it. The
-windows of one cycle are too few and too correlated for a batch.
+windows of one cycle are too few and too correlated for a batch. There are as many readers as windows in the pool.
 
 In training the newest weights act. Evaluations and the trained agent use an average of the last weights of the model
 and of the actor (`models.average`). The policy of the newest weights can change within few updates. The average changes
@@ -27,7 +31,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents.base import ControllerAgent, Metrics, Range
-from beliefrl.models import average, double_q, pool
+from beliefrl.models import average, double_q, pool, reading
 from beliefrl.models.average import Average
 from beliefrl.models.double_q import DoubleQController, Policy, Samples
 from beliefrl.models.nets import LSTMState, descend, standardise, update_statistics
@@ -55,12 +59,20 @@ class Memory(NamedTuple):
     note: Note  # on the last timestep
 
 
+class Beliefs(NamedTuple):
+    """The beliefs of windows, formed by the model before its update, and which transitions to learn from."""
+
+    belief: Float[Array, "time batch belief"]  # [h_t, x_t], not standardised
+    valid: Bool[Array, "length batch"]
+
+
 class State(NamedTuple):
     """Everything that training changes."""
 
     model: PredictiveModel
     controller: DoubleQController
     scales: Scales
+    readers: LSTMState  # at the first timestep of each reader's next window, before it is perceived; leaves (reader, d)
     pool: Pool
     model_optimiser: optax.OptState
     controller_optimiser: OptimiserState
@@ -108,8 +120,9 @@ class PredictiveSACAgent(ControllerAgent):
     """Steps in a sampled sequence."""
     sequences: int = 8
     """Sequences in an update of the model."""
-    burn_in: int = 32
-    """Burn-in: at most this many steps before a sequence initialise its state, from zero."""
+    jump: float = 1 / 16
+    """Probability that a sequence does not continue an earlier one, but begins at a random place of the replay, with an
+    empty state."""
     d_size: int = 128
     """Size of the LSTM's state h."""
     hidden_size: int = 128
@@ -143,9 +156,9 @@ class PredictiveSACAgent(ControllerAgent):
         super().__post_init__()
         check_range(self, ("batch_size", "seq_len", "sequences", "pool", "longest_memory"), 1)
         check_range(self, ("d_size", "hidden_size"), 1, WIDEST)
-        check_range(self, ("burn_in", "pretrain_updates"), 0)
+        check_range(self, ("pretrain_updates",), 0)
         check_range(self, ("alpha_start",), 1e-6)
-        check_range(self, ("lr_model", "long_memories", "trace_decay", "off_policy_trace"), 0, 1)
+        check_range(self, ("lr_model", "jump", "long_memories", "trace_decay", "off_policy_trace"), 0, 1)
         check_range(self, ("average_rate",), 1e-6, 1)
         check_range(self, ("reward_memory",), 1)
 
@@ -153,7 +166,7 @@ class PredictiveSACAgent(ControllerAgent):
 
     @property
     def window(self) -> WindowShape:
-        return WindowShape(self.burn_in, self.seq_len)
+        return WindowShape(0, self.seq_len, self.pool * self.sequences, self.jump)
 
     @property
     def losses(self) -> tuple[str, ...]:
@@ -182,6 +195,7 @@ class PredictiveSACAgent(ControllerAgent):
             model,
             controller,
             initial_scales(spec.obs_dim, belief),
+            model.lstm.start(self.window.readers),
             pool.empty((self.pool, self.sequences * self.seq_len), belief, spec.action_dim),
             self.model_optimiser.init(model),  # pyright: ignore[reportArgumentType]
             double_q.init_optimisers(self.optimisers, controller),
@@ -189,7 +203,7 @@ class PredictiveSACAgent(ControllerAgent):
         )
 
     def networks(self, state: State) -> State:
-        """The state with the averages in place of the newest weights, without its optimisers and the pool.
+        """The state with the averages in place of the newest weights, without what only updates need.
 
         Before the first update there are no averages, and the newest weights stay.
         """
@@ -197,6 +211,7 @@ class PredictiveSACAgent(ControllerAgent):
         return state._replace(
             model=model,
             controller=state.controller._replace(actor=actor),
+            readers=(),
             pool=(),
             model_optimiser=(),
             controller_optimiser=(),
@@ -233,44 +248,46 @@ class PredictiveSACAgent(ControllerAgent):
         usual = state.scales.usual.include(step.reward, windows.exists & ~step.is_first)
         return state._replace(scales=state.scales._replace(usual=usual)), metrics
 
-    def learn_model(self, state: State, windows: Window) -> tuple[State, Float[Array, "kept batch belief"], Metrics]:
-        """One Adam step on J_model; also returns the beliefs after the burn-in, formed before the step."""
-        scales, step = state.scales.include(windows), windows.step
-        x = scales.perception(step)
-        inputs = scales.model_input(x, windows.note.rewards)
+    def learn_model(self, state: State, windows: Window) -> tuple[State, Beliefs, Metrics]:
+        """One Adam step on J_model."""
+        scales, step, after = state.scales.include(windows), windows.step, windows.between(1, None).step
+        x, known = scales.perception(step), reading.is_known(windows)
+        inputs, start = scales.model_input(x, windows.note.rewards), reading.start(windows, state.readers)
+        valid = transitions(windows, 0) & known[:-1]
 
-        def loss(model: PredictiveModel) -> tuple[Float[Array, ""], Float[Array, "kept batch d"]]:
-            d = model.unroll(inputs, step.is_first, self.burn_in)
-            after, valid = windows.between(self.burn_in + 1, None).step, transitions(windows, self.burn_in)
-            return prediction_loss(model, d, after.prev_action, scales.prediction(after), valid), d
+        def loss(model: PredictiveModel) -> tuple[Float[Array, ""], LSTMState]:
+            lstm = model.lstm.unroll(start, inputs, step.is_first)
+            return prediction_loss(model, lstm.d, after.prev_action, scales.prediction(after), valid), lstm
 
-        (j_model, d), gradient = jax.value_and_grad(loss, has_aux=True)(state.model)
+        (j_model, lstm), gradient = jax.value_and_grad(loss, has_aux=True)(state.model)
         model, optimiser = descend(self.model_optimiser, gradient, state.model_optimiser, state.model)
-        belief = jnp.concatenate([d, x[self.burn_in :]], axis=-1)
-        scales = scales._replace(belief=update_statistics(scales.belief, belief, windows.exists[self.burn_in :]))
-        return state._replace(model=model, model_optimiser=optimiser, scales=scales), belief, {"loss_model": j_model}
+        belief = jnp.concatenate([lstm.d, x], axis=-1)
+        scales = scales._replace(belief=update_statistics(scales.belief, belief, windows.exists & known))
+        readers = reading.end(windows, state.readers, lstm)
+        state = state._replace(model=model, model_optimiser=optimiser, scales=scales, readers=readers)
+        return state, Beliefs(belief, valid), {"loss_model": j_model}
 
     # Learning the controller
 
     def begin_cycle(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Samples, Metrics]:
         """One update of the model; then a batch from the pool for each update of the controller."""
         key_targets, key_draw = jax.random.split(key)
-        state, belief, metrics = self.learn_model(state, windows)
-        samples, likeness = self.samples(state, windows, belief, key_targets)
+        state, beliefs, metrics = self.learn_model(state, windows)
+        samples, likeness = self.samples(state, windows, beliefs, key_targets)
         found = pool.add(state.pool, samples)
         batches = pool.draw(found, key_draw, (self.cycle, self.batch_size))
         batches = batches._replace(belief=standardise(state.scales.belief, batches.belief))
         return state._replace(pool=found), batches, metrics | {"likeness": likeness}
 
     def samples(
-        self, state: State, windows: Window, belief: Float[Array, "kept batch belief"], key: Key[Array, ""]
+        self, state: State, windows: Window, beliefs: Beliefs, key: Key[Array, ""]
     ) -> tuple[Samples, Float[Array, ""]]:
-        """The transitions of windows after the burn-in with their targets; also the mean of min(1, π / b)."""
-        after, valid = windows.between(self.burn_in, None), transitions(windows, self.burn_in)
-        s = standardise(state.scales.belief, belief)
+        """The transitions of windows with their targets; also the mean of min(1, π / b)."""
+        belief, valid = beliefs
+        s, step, b = standardise(state.scales.belief, belief), windows.step, windows.note.policy
         discounts = self.gamma, self.trace_decay, self.off_policy_trace
-        y, likeness = double_q.targets(state.controller, s, after.step, valid, after.note.policy, key, *discounts)
-        samples = Samples(belief[:-1], after.step.prev_action[1:], y, valid)
+        y, likeness = double_q.targets(state.controller, s, step, valid, b, key, *discounts)
+        samples = Samples(belief[:-1], step.prev_action[1:], y, valid)
         return samples, valid_mean(likeness.ravel(), valid.ravel())
 
     def update(self, state: State, batch: Samples, key: Key[Array, ""]) -> tuple[State, Metrics]:

@@ -44,16 +44,6 @@ class PredictiveModel(eqx.Module):
         self.lstm = LSTM(obs + action + 1 + memories, d)
         self.predictor = MLP((d + action, hidden, obs + 1), jax.nn.relu)
 
-    def unroll(
-        self, x: Float[Array, "time batch input"], is_first: Bool[Array, "time batch"], burn_in: int
-    ) -> Float[Array, "kept batch d"]:
-        """h_t after the burn-in, for inputs [x_t, m_t / σ_r]. The burn-in starts from zero and gets no gradient."""
-        start = self.lstm.start(x.shape[1])
-        if burn_in:
-            burnt_in = jax.lax.stop_gradient(self.lstm).unroll(start, x[:burn_in], is_first[:burn_in])
-            start = jax.tree.map(lambda leaf: leaf[-1], burnt_in)
-        return self.lstm.unroll(start, x[burn_in:], is_first[burn_in:]).d
-
     def next_state(self, state: LSTMState, x: Float[Array, " input"], is_first: Bool[Array, ""]) -> LSTMState:
         """The LSTM's state after [x_t, m_t / σ_r]."""
         start = jax.tree.map(lambda leaf: leaf[None], state)

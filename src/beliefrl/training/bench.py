@@ -165,10 +165,10 @@ def _update_parts(agent: Agent, timed: _Timed) -> tuple[dict[str, float], float]
     """The updates' seconds per environment step, and their floating-point operations (`_flop`)."""
     seeds = timed.seeds
 
-    def sample(replay: ring.Replay, key: Key[Array, ""]):
-        return ring.sample(replay, key, agent.cycle_windows, agent.window)
+    def read(seed: phases.SeedState, key: Key[Array, ""]):
+        return ring.windows(seed.replay, seed.readers, key, agent.cycle_windows, agent.window)[0]
 
-    windows = jax.jit(jax.vmap(sample))(seeds.replay, timed.keys)
+    windows = jax.jit(jax.vmap(read))(seeds, timed.keys)
     given = (seeds.state, windows, timed.keys)
 
     def mapped(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -269,6 +269,5 @@ def _learn(
 ) -> tuple[SeedState, ActorOutput, Episode, Metrics]:
     """Record the last step of a round, learn, and act again."""
     seed, episode = _record(agent, spec, envs, seed, result, step)
-    state, metrics = phases.learn_round(agent, seed, step + envs - phases.round_length(agent, envs), envs)
-    seed = seed._replace(state=state)
+    seed, metrics = phases.learn_round(agent, seed, step + envs - phases.round_length(agent, envs), envs)
     return seed, _act(agent, envs, seed, step + envs), episode, metrics

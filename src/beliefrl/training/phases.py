@@ -30,7 +30,7 @@ from beliefrl.agents import Agent
 from beliefrl.tasks import Task
 from beliefrl.training import replay as ring
 from beliefrl.training import rollout
-from beliefrl.training.replay import Replay
+from beliefrl.training.replay import Readers, Replay
 from beliefrl.training.rollout import ActorState, Episode
 from beliefrl.types import Spec, UserError
 
@@ -59,6 +59,7 @@ class SeedState(NamedTuple):
     state: Any  # the agent's
     actor: ActorState
     replay: Replay
+    readers: Readers | None  # of the replay, if the agent's windows are read in order
     key: Key[Array, ""]
 
 
@@ -89,7 +90,7 @@ def seed_of(
     """A new agent and an empty replay for actors at their first timestep."""
     state = rollout.strong(agent.init(key_state, spec))
     replay = on_each_env(envs, lambda actor: ring.init(rollout.stored(agent, actor), capacity))(actor)
-    return SeedState(state, actor, replay, key)
+    return SeedState(state, actor, replay, ring.init_readers(agent.window), key)
 
 
 def _write(log: Episode, index: Int[Array, ""], episode: Episode) -> Episode:
@@ -154,9 +155,9 @@ def pretrain(
     @partial(jax.vmap, in_axes=(0, None))
     def update(seed: SeedState, number: Int[Array, ""]) -> tuple[SeedState, Metrics]:
         key_sample, key = jax.random.split(step_key(seed.key, number, PRETRAIN))
-        windows = ring.sample(seed.replay, key_sample, agent.pretrain_windows, agent.window)
+        windows, readers = ring.windows(seed.replay, seed.readers, key_sample, agent.pretrain_windows, agent.window)
         state, metrics = agent.pretrain(seed.state, windows, key)
-        return seed._replace(state=state), metrics
+        return seed._replace(state=state, readers=readers), metrics
 
     def step(i, carry):
         seeds, totals = carry
@@ -212,30 +213,34 @@ def _round(
         return _act(agent, task, envs, seed, log, step, index + step - first)
 
     seed, log = jax.lax.fori_loop(first // envs, (first + length) // envs, act, (seed, log))
-    state, metrics = learn_round(agent, seed, first, envs)
-    return seed._replace(state=state), log, metrics
+    seed, metrics = learn_round(agent, seed, first, envs)
+    return seed, log, metrics
 
 
-def learn_round(agent: Agent, seed: SeedState, first: Int[Array, ""], envs: int = 1) -> tuple[Any, Metrics]:
-    """The updates after the steps of the round that began at environment step `first`: new state and mean metrics."""
+def learn_round(agent: Agent, seed: SeedState, first: Int[Array, ""], envs: int = 1) -> tuple[SeedState, Metrics]:
+    """The updates after the steps of the round that began at environment step `first`; metrics are their means."""
     cycles = round_length(agent, envs) // agent.cycle
     if cycles == 1:
         return learn_cycle(agent, seed, first)
 
-    def cycle(state, number):
-        return learn_cycle(agent, seed._replace(state=state), first + number * agent.cycle)
+    def cycle(learned, number):  # the scan carries what learning changes: else XLA copies the ring
+        state, readers = learned
+        before = seed._replace(state=state, readers=readers)
+        after, metrics = learn_cycle(agent, before, first + number * agent.cycle)
+        return (after.state, after.readers), metrics
 
-    state, metrics = jax.lax.scan(cycle, seed.state, jnp.arange(cycles))
-    return state, jax.tree.map(lambda each: jnp.mean(each, axis=0), metrics)
+    (state, readers), metrics = jax.lax.scan(cycle, (seed.state, seed.readers), jnp.arange(cycles))
+    return seed._replace(state=state, readers=readers), jax.tree.map(lambda each: jnp.mean(each, axis=0), metrics)
 
 
-def learn_cycle(agent: Agent, seed: SeedState, first: Int[Array, ""]) -> tuple[Any, Metrics]:
-    """The updates after the steps of the cycle that began at environment step `first`: the new state and metrics.
+def learn_cycle(agent: Agent, seed: SeedState, first: Int[Array, ""]) -> tuple[SeedState, Metrics]:
+    """The updates after the steps of the cycle that began at environment step `first`, and their metrics.
 
     Raises:
         UserError: `begin_cycle` and `update` return a metric of the same name.
     """
-    windows = ring.sample(seed.replay, step_key(seed.key, first, SAMPLE), agent.cycle_windows, agent.window)
+    key = step_key(seed.key, first, SAMPLE)
+    windows, readers = ring.windows(seed.replay, seed.readers, key, agent.cycle_windows, agent.window)
     state, batches, model_metrics = agent.begin_cycle(seed.state, windows, step_key(seed.key, first, CYCLE))
 
     count = len(jax.tree.leaves(batches)[0])
@@ -249,7 +254,7 @@ def learn_cycle(agent: Agent, seed: SeedState, first: Int[Array, ""]) -> tuple[A
     state, metrics = jax.lax.scan(update, state, (updates, batches))
     for name in model_metrics.keys() & metrics.keys():
         raise UserError(f"begin_cycle and update of the agent both return a metric {name!r}: rename one of them.")
-    return state, model_metrics | jax.tree.map(jnp.mean, metrics)
+    return seed._replace(state=state, readers=readers), model_metrics | jax.tree.map(jnp.mean, metrics)
 
 
 def evaluate(agent: Agent, task: Task, state: Any, key: Key[Array, ""], episodes: int) -> Episode:

@@ -1,4 +1,4 @@
-"""The replay: a ring of timesteps, and windows drawn from it.
+"""The replay: a ring of timesteps, and windows drawn from it or read in order.
 
 The ring has one record per timestep, including the last observation of an episode. So the value at a time limit can be
 bootstrapped, and no observation is stored twice. Within a compiled step, additions come before draws, and a masked
@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, Key
 
-from beliefrl.types import StoredTimestep, Timestep, Window, WindowShape
+from beliefrl.types import Reading, StoredTimestep, Timestep, Window, WindowShape
 
 
 class Replay(NamedTuple):
@@ -41,6 +41,57 @@ def add(replay: Replay, timestep: StoredTimestep, keep: Bool[Array, ""] | bool =
     return Replay(timesteps, replay.added + jnp.asarray(keep, replay.added.dtype))
 
 
+class Readers(NamedTuple):
+    """Where each reader reads next."""
+
+    number: Int[Array, " reader"]  # running number of a timestep; -1 before the first window
+    ring: Int[Array, " reader"]
+    turn: Int[Array, ""]  # the reader whose turn is next
+
+
+def init_readers(shape: WindowShape) -> Readers | None:
+    """Readers before their first window; None if the windows are drawn at random."""
+    nowhere = jnp.full(shape.readers, -1)
+    return Readers(nowhere, jnp.zeros_like(nowhere), jnp.zeros((), int)) if shape.readers else None
+
+
+def windows(
+    replay: Replay, readers: Readers | None, key: Key[Array, ""], batch: int, shape: WindowShape
+) -> tuple[Window, Readers | None]:
+    """`batch` windows, read by the next readers or drawn at random; also the readers after it."""
+    if readers is None:
+        return sample(replay, key, batch, shape), None
+    return read(replay, readers, key, batch, shape)
+
+
+def read(
+    replay: Replay, readers: Readers, key: Key[Array, ""], batch: int, shape: WindowShape
+) -> tuple[Window, Readers]:
+    """The windows of the next `batch` readers, leaves (time, batch, ...), and the readers after it.
+
+    A reader continues where its last window ended. The last timestep of a window is the first of the next one, so
+    every transition is in one of them. It jumps to a place that `sample` could draw with the probability `shape.jump`,
+    if the replay does not yet have the whole next window, or if it no longer has it.
+    """
+    reader = (readers.turn + jnp.arange(batch)) % shape.readers
+    key_place, key_jump = jax.random.split(key)
+    number, of_ring = readers.number[reader], readers.ring[reader]
+    oldest, added = span(replay, of_ring)
+    stored = (number >= oldest) & (number + shape.length < added)
+    continues = stored & ~jax.random.bernoulli(key_jump, shape.jump, (batch,))
+    place = places(replay, key_place, batch, shape.length)
+    number, of_ring = (jnp.where(continues, *pair) for pair in zip((number, of_ring), place, strict=True))
+    numbers = number[None] + jnp.arange(shape.length + 1)[:, None]
+    timesteps = gather(replay, numbers, of_ring[None])
+    after = Readers(
+        readers.number.at[reader].set(numbers[-1]),
+        readers.ring.at[reader].set(of_ring),
+        (readers.turn + batch) % shape.readers,
+    )
+    exists = numbers < span(replay, of_ring)[1][None]
+    return Window(timesteps.step, timesteps.note, exists, Reading(reader, continues)), after
+
+
 def sample(replay: Replay, key: Key[Array, ""], batch: int, shape: WindowShape) -> Window:
     """Draw `batch` windows of burn_in + length + 1 timesteps, leaves (time, batch, ...).
 
@@ -49,29 +100,40 @@ def sample(replay: Replay, key: Key[Array, ""], batch: int, shape: WindowShape) 
     than a window needs the rest overhangs as well. What overhangs is marked in `exists`. With several rings, the start
     is uniform over those of all rings.
     """
-    oldest = jnp.maximum(replay.added - capacity(replay), 0)
-    stored = replay.added - oldest
-    starts = jnp.maximum(stored - shape.length, 1)
-    if replay.added.ndim:
-        after = jnp.cumsum(starts)
-        start = jax.random.randint(key, (1, batch), 0, after[-1])
-        ring = jnp.searchsorted(after, start, side="right")
-        start, oldest, stored = start - (after - starts)[ring], oldest[ring], stored[ring]
-    else:
-        start, ring = jax.random.randint(key, (batch, 1), 0, starts).T, None
-    position = start + jnp.arange(-shape.burn_in, shape.length + 1)[:, None]  # 0 is the oldest timestep
-    timesteps = gather(replay, oldest + position, ring)
-    step = timesteps.step._replace(is_first=timesteps.step.is_first | (position <= 0))
-    return Window(step, timesteps.note, (position >= 0) & (position < stored))
+    start, ring = places(replay, key, batch, shape.length)
+    oldest, added = (bound[None] for bound in span(replay, ring))
+    numbers = start[None] + jnp.arange(-shape.burn_in, shape.length + 1)[:, None]
+    timesteps = gather(replay, numbers, ring[None])
+    step = timesteps.step._replace(is_first=timesteps.step.is_first | (numbers <= oldest))
+    return Window(step, timesteps.note, (numbers >= oldest) & (numbers < added))
+
+
+def places(
+    replay: Replay, key: Key[Array, ""], batch: int, length: int
+) -> tuple[Int[Array, " batch"], Int[Array, " batch"]]:
+    """Running numbers of timesteps from which `length` transitions are stored, uniform over all, and their rings."""
+    oldest, added = span(replay, jnp.arange(replay.added.size))
+    starts = jnp.maximum(added - oldest - length, 1)
+    after = jnp.cumsum(starts)
+    start = jax.random.randint(key, (batch,), 0, after[-1])
+    ring = jnp.searchsorted(after, start, side="right")
+    return oldest[ring] + start - (after - starts)[ring], ring
+
+
+def span(replay: Replay, ring: Int[Array, " batch"]) -> tuple[Int[Array, " batch"], Int[Array, " batch"]]:
+    """The running number of the oldest timestep in these rings, and the number after the newest."""
+    added = jnp.atleast_1d(replay.added)[ring]
+    return jnp.maximum(added - capacity(replay), 0), added
 
 
 def gather(replay: Replay, number: Int[Array, "*shape"], ring: Int[Array, "1 batch"] | None = None) -> StoredTimestep:
     """The timesteps of these running numbers (0 is the first ever added), leaves (*shape, ...).
 
-    With several rings, `ring` has the index of the ring for each number; it broadcasts against `number`.
+    `ring` has the index of the ring for each number; it broadcasts against `number`. A lone ring needs none.
     """
     index = number % capacity(replay)
-    return jax.tree.map(lambda leaf: leaf[index] if ring is None else leaf[ring, index], replay.timesteps)
+    several = replay.added.ndim > 0
+    return jax.tree.map(lambda leaf: leaf[ring, index] if several else leaf[index], replay.timesteps)
 
 
 def history(replay: Replay, length: int) -> tuple[Timestep, Bool[Array, " length"]]:
