@@ -57,11 +57,11 @@ def differ(a, b):
 def changed_where_missing(agent, state, window, exists):
     """What a cycle and its updates make of windows, and of the same with other timesteps where none exist."""
     other = windows(jax.random.key(9), *exists.shape)
-    other = other._replace(note=jax.tree.map(lambda leaf: leaf + 1.0, window.note), reading=window.reading)
+    other = other._replace(note=jax.tree.map(lambda leaf: leaf + 1.0, window.note))
     exists = exists.T
     changed = jax.tree.map(
         lambda a, b: jnp.where(exists.reshape(exists.shape + (1,) * (a.ndim - 2)), a, b),
-        window._replace(exists=exists),
+        window._replace(exists=exists, reading=None),
         other._replace(exists=exists),
     )
 
@@ -71,7 +71,7 @@ def changed_where_missing(agent, state, window, exists):
         after, more = agent.update(after, jax.tree.map(lambda leaf: leaf[0], batches), jax.random.key(3))
         return after, metrics | more
 
-    return [learned(given) for given in (window._replace(exists=exists), changed)]
+    return [learned(given._replace(exists=exists, reading=window.reading)) for given in (window, changed)]
 
 
 def slope(function, at, direction, by=1e-2):

@@ -114,17 +114,21 @@ def test_a_crashed_training_goes_on_to_the_last_bit(tmp_path):
     assert files(tmp_path / "run") == files(tmp_path / "whole")
 
 
+LIKE = StoredTimestep(Timestep(jnp.zeros(1), jnp.zeros(()), jnp.zeros(1), *jnp.zeros((2,), bool)), (jnp.zeros(()),))
+
+
+def filled(count):
+    """A ring for 32 timesteps after `count` of them, which have their running numbers as notes."""
+
+    def add(replay, number):
+        value = number.astype(float)
+        step = Timestep(value[None], value, value[None], jnp.array(False), jnp.array(False))
+        return ring.add(replay, StoredTimestep(step, (value,)), number < count), None
+
+    return jax.lax.scan(add, ring.init(LIKE, 32), jnp.arange(40))[0]
+
+
 def test_windows_begin_at_every_transition_of_every_ring():
-    def filled(count):
-        def add(replay, number):
-            value = number.astype(float)
-            step = Timestep(value[None], value, value[None], jnp.array(False), jnp.array(False))
-            return ring.add(replay, StoredTimestep(step, (value,)), number < count), None
-
-        return jax.lax.scan(add, ring.init(like, 32), jnp.arange(40))[0]
-
-    number = jnp.zeros(())
-    like = StoredTimestep(Timestep(number[None], number, number[None], jnp.array(False), jnp.array(False)), (number,))
     shape, counts = WindowShape(2, 1), jnp.array([4, 20, 40])
     window = jax.jit(lambda: ring.sample(jax.vmap(filled)(counts), jax.random.key(0), 4000, shape))()
     now = np.asarray(window.note[0])[2][np.asarray(transitions(window, 2))[0]].astype(int)
@@ -133,6 +137,27 @@ def test_windows_begin_at_every_transition_of_every_ring():
     expected = 4000 / len(starts) * np.bincount(starts, minlength=40)
     assert not found[expected == 0].any()
     np.testing.assert_allclose(found, expected, atol=5 * np.sqrt(expected.max()))
+
+
+def test_a_reader_stays_in_its_ring_until_it_jumps():
+    """Of rings with 4, 20 and 40 timesteps, notes are the running number plus 100 for each ring before."""
+    shape, counts = WindowShape(0, 3, readers=8, jump=0.0), jnp.array([4, 20, 40])
+    replay = jax.vmap(filled)(counts)
+    note = replay.timesteps.note[0] + 100 * jnp.arange(3.0)[:, None]
+    replay = replay._replace(timesteps=replay.timesteps._replace(note=(note,)))
+    read, readers = jax.jit(lambda readers, key: ring.read(replay, readers, key, 8, shape)), ring.init_readers(shape)
+    last, rings, continued = None, set(), 0
+    for turn in range(40):
+        window, readers = read(readers, jax.random.key(turn))
+        rows, goes_on = np.asarray(window.note[0]).T, np.asarray(window.reading.continues)
+        np.testing.assert_array_equal(np.diff(rows), 1)  # in one ring
+        assert window.exists.all()
+        if last is not None:
+            np.testing.assert_array_equal(rows[goes_on, 0], last[goes_on])
+            np.testing.assert_array_equal(goes_on, last % 100 + shape.length < counts[(last // 100).astype(int)])
+        last, continued, rings = rows[:, -1], continued + goes_on.sum(), rings | set(rows[:, 0] // 100)
+    assert rings == {0, 1, 2}
+    assert continued > 100
 
 
 def test_the_replay_is_divided_among_the_environments():

@@ -225,3 +225,84 @@ def test_evaluation_draws_each_sampled_action_anew():
     one, other, mode = np.asarray(result.episode_return)
     assert len({one, other, mode}) == 3
     assert mode == 0
+
+
+SHAPE = WindowShape(0, 4, readers=6, jump=0.0)  # two of six readers at a time
+
+
+@functools.partial(jax.jit, static_argnums=(3,))
+def read(replay, readers, key, shape=SHAPE):
+    return ring.read(replay, readers, key, 2, shape)
+
+
+def begun(replay, key=0, shape=SHAPE):
+    """The readers after each has read its first window, and these windows."""
+    readers, windows = ring.init_readers(shape), []
+    for number in range(3):
+        window, readers = read(replay, readers, jax.random.key(key + number), shape)
+        windows.append(window)
+    return readers, windows
+
+
+def numbers(window):
+    """The running numbers of the timesteps of windows, (batch, time)."""
+    return np.asarray(window.note[0]).T.astype(int)
+
+
+def test_readers_take_turns_and_first_jump_to_random_places():
+    readers, windows = begun(filled(64, np.zeros(40, bool)))
+    assert [w.reading.reader.tolist() for w in windows] == [[0, 1], [2, 3], [4, 5]]
+    assert not any(w.reading.continues.any() for w in windows)
+    assert len({row[0] for w in windows for row in numbers(w)}) > 3
+    assert int(readers.turn) == 0
+
+
+def test_a_reader_continues_with_the_last_timestep_of_its_window_until_too_little_follows():
+    replay = filled(64, np.arange(40) % 7 == 0)
+    readers, windows = begun(replay)
+    last, continued = np.concatenate([numbers(w)[:, -1] for w in windows]), 0
+    for turn in range(30):
+        window, readers = read(replay, readers, jax.random.key(100 + turn))
+        rows, reader = numbers(window), np.asarray(window.reading.reader)
+        possible = last[reader] + SHAPE.length < 40
+        np.testing.assert_array_equal(window.reading.continues, possible)
+        np.testing.assert_array_equal(rows[possible, 0], last[reader][possible])
+        np.testing.assert_array_equal(np.diff(rows), 1)
+        np.testing.assert_array_equal(np.asarray(window.step.is_first).T, rows % 7 == 0)
+        assert window.exists.all()
+        last[reader], continued = rows[:, -1], continued + possible.sum()
+    assert continued > 30
+
+
+def test_a_reader_jumps_from_timesteps_that_were_replaced():
+    readers, windows = begun(filled(16, np.zeros(16, bool)))
+    later = filled(16, np.zeros(24, bool))  # has the last 16
+    window, _ = read(later, readers, jax.random.key(9))
+    last = numbers(windows[0])[:, -1]
+    np.testing.assert_array_equal(window.reading.continues, last >= 8)
+    assert (numbers(window) >= 8).all()
+
+
+def test_readers_jump_with_the_given_probability():
+    replay = filled(64, np.zeros(40, bool))
+    always = begun(replay, shape=SHAPE._replace(jump=1.0))[0]
+    assert not read(replay, always, jax.random.key(1), SHAPE._replace(jump=1.0))[0].reading.continues.any()
+    near = begun(replay)[0]._replace(number=jnp.zeros(6, int))
+    shape = SHAPE._replace(jump=0.25)
+    keys = jax.random.split(jax.random.key(2), 400)
+    continues = jax.jit(jax.vmap(lambda key: ring.read(replay, near, key, 2, shape)[0].reading.continues))(keys)
+    assert abs(continues.mean() - 0.75) < 0.06
+
+
+def test_a_reader_of_a_replay_with_less_than_a_window_marks_what_does_not_exist():
+    window, _ = read(filled(64, np.zeros(3, bool)), ring.init_readers(SHAPE), jax.random.key(0))
+    np.testing.assert_array_equal(np.asarray(window.exists).T, [[True, True, True, False, False]] * 2)
+
+
+def test_agents_without_readers_draw_windows_at_random():
+    replay, shape = filled(64, np.zeros(40, bool)), WindowShape(2, 3)
+    assert ring.init_readers(shape) is None
+    window, readers = ring.windows(replay, None, jax.random.key(0), 8, shape)
+    assert readers is None
+    assert window.reading is None
+    np.testing.assert_array_equal(numbers(window), numbers(sample(replay, jax.random.key(0), 8, shape)))
