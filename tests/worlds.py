@@ -157,6 +157,34 @@ class CountingAgent:
         return state._replace(seen=state.seen + metrics["valid"].astype(int)), metrics
 
 
+class ReadingAgent(CountingAgent):
+    """Reads in order. `offset` counts the windows that continue; `broken` also counts those that begin elsewhere."""
+
+    window: ClassVar = WindowShape(0, 6, readers=16, jump=0.25)
+
+    def init(self, key, spec):
+        return super().init(key, spec)._replace(seen=jnp.full(16, -1.0))  # the last observation of each reader
+
+    def follow(self, state, windows):
+        reader, continues = windows.reading
+        obs = windows.step.obs[..., 0]
+        broken = jnp.sum(continues & (obs[0] != state.seen[reader])).astype(float)
+        return CountingState(state.offset + jnp.sum(continues), state.seen.at[reader].set(obs[-1])), broken
+
+    def pretrain(self, state, windows, key):
+        state, broken = self.follow(state, windows)
+        metrics = self.check(windows)
+        return state, metrics | {"broken": metrics["broken"] + broken}
+
+    def begin_cycle(self, state, windows, key):
+        state, broken = self.follow(state, windows)
+        batches = jax.tree.map(lambda leaf: leaf[None], windows._replace(reading=None))
+        return state, batches, {"jumped": broken}
+
+    def update(self, state, batch, key):
+        return state, self.check(batch)
+
+
 def installed(folder, monkeypatch, group, lines="", **points):
     """The entry_points.txt of a package that is installed in a folder: NAME=MODULE:CLASS of a group."""
     info = folder / "some_package-1.0.dist-info"

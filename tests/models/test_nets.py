@@ -111,6 +111,12 @@ def test_a_scale_has_the_moments_of_all_valid_vectors_and_makes_them_standard():
     np.testing.assert_allclose(made.std(0), [0.91, 1.0], rtol=0.05)  # 0.01 / (0.01 + 0.001): the quiet stay quieter
 
 
+def test_a_scale_does_not_change_without_valid_vectors():
+    for old in (initial_statistics(2), RunningStatistics(jnp.full(2, 3.0), jnp.full(2, 4.0), jnp.array(7.0))):
+        new = jax.jit(update_statistics)(old, jnp.full((5, 2), 9.0), jnp.zeros(5, bool))
+        jax.tree.map(np.testing.assert_array_equal, new, old)
+
+
 def test_a_scale_forgets_and_its_entries_are_bounded():
     old = RunningStatistics(jnp.zeros(1), jnp.ones(1), jnp.array(1e6))
     after = jax.lax.fori_loop(

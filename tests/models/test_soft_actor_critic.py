@@ -277,6 +277,12 @@ def test_a_new_unit_leaves_every_q_as_it_is():
         np.testing.assert_allclose(float(after.unit.u) * now, float(controller.unit.u) * before, rtol=1e-4, atol=1e-4)
 
 
+def test_a_batch_without_valid_targets_does_not_change_the_unit():
+    controller, data = make(), random_batch()
+    after = jax.jit(double_q.rescale)(controller, data.target, jnp.zeros_like(data.valid))
+    jax.tree.map(np.testing.assert_array_equal, after.unit, controller.unit)
+
+
 def test_the_unit_is_the_root_mean_square_of_targets():
     controller, valid = make()._replace(unit=Unit(jnp.ones(()), jnp.zeros(()))), jnp.array([True, True, True, False])
     for y in ([1.0, 2.0, 2.0, 99.0], [3.0, 0.0, 0.0, 99.0]):

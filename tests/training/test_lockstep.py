@@ -18,7 +18,7 @@ from beliefrl.training.schedule import Options, _processes, stages
 from beliefrl.types import StoredTimestep, Timestep, WindowShape, transitions
 from training.test_host_loop import Hanging, Wrapped
 from training.test_resume import AGENT, OPTIONS, Crash, crash_at, files
-from worlds import SHARED, Counting, CountingAgent, leaves, trained
+from worlds import SHARED, Counting, CountingAgent, ReadingAgent, leaves, trained
 from wrong import Fine, Sleeping, Stuck, raising
 
 ENVS = 3  # with the agent's cycles of 4 steps, a round has 12
@@ -55,6 +55,29 @@ def test_every_environment_is_recorded_with_its_own_episodes(task, hosted):
     assert explored.episodes.done.sum() + done.sum() == 2 * ENVS * (32 // length)
     np.testing.assert_array_equal(np.asarray(learned.episodes.length)[done], length)
     np.testing.assert_array_equal(np.asarray(learned.episodes.episode_return)[done], length * (length + 1) / 2)
+    program.close()
+
+
+@pytest.mark.parametrize(("envs", "hosted"), [(1, False), (ENVS, False), (1, True), (ENVS, True)])
+def test_readers_go_on_through_pretraining_and_every_cycle(envs, hosted):
+    """Five windows in each of 6 updates of the pre-training, and eight in each of 15 cycles: at most 150 continue."""
+    agent, task = ReadingAgent(), Counting(max_steps=20)
+    if hosted:
+        wrapped = GymnasiumTask(Wrapped, "counting", {"task": task}, measures=("success",))
+        program = host_loop.program(agent, wrapped, 90, 2, range(2), "never", envs=envs)
+    else:
+        program = phases.compile_program(agent, task, 90, 2, envs)
+    seeds = program.begin(jax.random.split(jax.random.key(0), 2))
+    seeds, _ = program.explore(seeds, 0, 60)
+    seeds, pretrained = program.pretrain(seeds, 0, 6)
+    before = np.asarray(seeds.state.offset)
+    np.testing.assert_array_equal(seeds.readers.turn, 30 % 16)
+    seeds, learned = program.learn(seeds, 60, 60 // phases.round_length(agent, envs))
+    np.testing.assert_array_equal(seeds.readers.turn, 150 % 16)
+    for broken in (pretrained["broken"], learned.metrics["broken"], learned.metrics["jumped"]):
+        np.testing.assert_array_equal(broken, 0)
+    assert (before > 0).all()
+    assert (np.asarray(seeds.state.offset) - before > 20).all()
     program.close()
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from beliefrl.training import replay as ring
 from beliefrl.training import rollout
-from beliefrl.types import StoredTimestep, Timestep, WindowShape, transitions
+from beliefrl.types import StoredTimestep, Timestep, UserError, WindowShape, transitions
 from worlds import Counting, CountingAgent
 
 
@@ -275,12 +275,25 @@ def test_a_reader_continues_with_the_last_timestep_of_its_window_until_too_littl
 
 
 def test_a_reader_jumps_from_timesteps_that_were_replaced():
-    readers, windows = begun(filled(16, np.zeros(16, bool)))
+    readers, _ = begun(filled(16, np.zeros(16, bool)))
+    readers = readers._replace(number=jnp.array([7, 8, 9, 0, 11, 3]))
     later = filled(16, np.zeros(24, bool))  # has the last 16
-    window, _ = read(later, readers, jax.random.key(9))
-    last = numbers(windows[0])[:, -1]
-    np.testing.assert_array_equal(window.reading.continues, last >= 8)
-    assert (numbers(window) >= 8).all()
+    for number in range(3):
+        before = readers.number[2 * number : 2 * number + 2]
+        window, readers = read(later, readers, jax.random.key(number))
+        np.testing.assert_array_equal(window.reading.continues, before >= 8)
+        assert (numbers(window) >= 8).all()
+
+
+def test_after_a_jump_another_window_follows():
+    """If a ring has two windows; else the reader jumps to its oldest timestep."""
+    for count, most in ((40, 40 - 1 - 2 * SHAPE.length), (8, 0), (6, 0)):
+        replay, found = filled(64, np.zeros(count, bool)), set()
+        for key in range(40):
+            window, _ = read(replay, ring.init_readers(SHAPE), jax.random.key(key))
+            found |= set(numbers(window)[:, 0].tolist())
+        assert max(found) <= most
+        assert len(found) > most // 2
 
 
 def test_readers_jump_with_the_given_probability():
@@ -297,6 +310,21 @@ def test_readers_jump_with_the_given_probability():
 def test_a_reader_of_a_replay_with_less_than_a_window_marks_what_does_not_exist():
     window, _ = read(filled(64, np.zeros(3, bool)), ring.init_readers(SHAPE), jax.random.key(0))
     np.testing.assert_array_equal(np.asarray(window.exists).T, [[True, True, True, False, False]] * 2)
+
+
+def test_a_reader_does_not_continue_after_timesteps_that_did_not_exist():
+    first = ring.init_readers(SHAPE)
+    for number in range(3):  # all six readers
+        _, first = read(filled(64, np.zeros(3, bool)), first, jax.random.key(number))
+    window, _ = read(filled(64, np.zeros(40, bool)), first, jax.random.key(9))
+    assert not window.reading.continues.any()
+
+
+def test_impossible_readers_are_refused():
+    with pytest.raises(UserError, match="burn_in=2 is impossible with readers"):
+        ring.init_readers(SHAPE._replace(burn_in=2))
+    with pytest.raises(UserError, match="readers=6 is impossible: the agent reads 7 windows"):
+        ring.read(filled(64, np.zeros(40, bool)), ring.init_readers(SHAPE), jax.random.key(0), 7, SHAPE)
 
 
 def test_agents_without_readers_draw_windows_at_random():

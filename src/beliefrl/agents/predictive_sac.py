@@ -10,8 +10,8 @@ belief, and a soft actor-critic acts on it. It differs from `vrm` in this: one m
 variables and without a frozen copy; standardised inputs; λ-returns; no V.
 
 The model reads the replay in order (`training.replay.Readers`): each reader keeps the LSTM's state at the end of its
-last window and continues from there. So the beliefs in training have as long a memory as those of the actor, and there
-is no burn-in. After a jump the state is empty: the first window only fills it, until an episode begins.
+last window and continues from there. So in training a belief knows the episode since its beginning, or since the
+reader's last jump. After a jump the state is empty: the first window only fills it, until an episode begins.
 
 One unroll of the windows of a cycle serves both: the model learns from it, and its beliefs become transitions. A pool
 has the transitions of the last `pool` cycles with their targets, and the controller's batches are drawn from it. The
@@ -72,7 +72,7 @@ class State(NamedTuple):
     model: PredictiveModel
     controller: DoubleQController
     scales: Scales
-    readers: LSTMState  # at the first timestep of each reader's next window, before it is perceived; leaves (reader, d)
+    readers: LSTMState  # the LSTM's state before each reader's next window, leaves (reader, d)
     pool: Pool
     model_optimiser: optax.OptState
     controller_optimiser: OptimiserState
@@ -117,12 +117,12 @@ class PredictiveSACAgent(ControllerAgent):
     lr_model: float = 1e-3
     """Adam's learning rate for the model."""
     seq_len: int = 32
-    """Steps in a sampled sequence."""
+    """Steps in a window, and of the gradient through time."""
     sequences: int = 8
-    """Sequences in an update of the model."""
+    """Windows in an update of the model."""
     jump: float = 1 / 16
-    """Probability that a sequence does not continue an earlier one, but begins at a random place of the replay, with an
-    empty state."""
+    """Probability that a reader jumps to a random place of the replay before it reads a window. It also jumps at the
+    end of the replay. The state is then empty, and learning begins with the next window or episode."""
     d_size: int = 128
     """Size of the LSTM's state h."""
     hidden_size: int = 128

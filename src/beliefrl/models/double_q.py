@@ -173,10 +173,10 @@ def targets(
 def rescale(
     controller: DoubleQController, y: Float[Array, " batch"], valid: Bool[Array, " batch"]
 ) -> DoubleQController:
-    """The controller with u updated by the targets of one more batch; Q stays the same."""
-    old = controller.unit
-    rate = jnp.maximum(1 / (old.batches + 1), UNIT_RATE)
-    new = Unit(old.square + rate * (valid_mean(y**2, valid) - old.square), old.batches + 1)
+    """The controller with u updated by the valid targets of one more batch, if there are any; Q stays the same."""
+    old, some = controller.unit, jnp.any(valid)
+    rate = jnp.where(some, jnp.maximum(1 / (old.batches + 1), UNIT_RATE), 0.0)
+    new = Unit(old.square + rate * (valid_mean(y**2, valid) - old.square), old.batches + some)
 
     def rescaled(critic: MLP) -> MLP:
         return eqx.tree_at(

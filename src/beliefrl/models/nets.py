@@ -228,12 +228,14 @@ def initial_statistics(size: int) -> RunningStatistics:
 def update_statistics(
     statistics: RunningStatistics, x: Float[Array, "*batch size"], valid: Bool[Array, "*batch"]
 ) -> RunningStatistics:
-    """Include the valid vectors of one more batch.
+    """Include the valid vectors of one more batch. Without valid vectors nothing changes.
 
     This is an average over batches, and an exponential average after 1 / STATISTICS_RATE batches.
     """
-    batches = statistics.batches + 1
-    rate, flat, weight = jnp.maximum(1 / batches, STATISTICS_RATE), x.reshape(-1, x.shape[-1]), valid.ravel()
+    some = jnp.any(valid)
+    batches = statistics.batches + some
+    rate = jnp.where(some, jnp.maximum(1 / jnp.maximum(batches, 1), STATISTICS_RATE), 0.0)
+    flat, weight = x.reshape(-1, x.shape[-1]), valid.ravel()
     weight = weight / jnp.maximum(jnp.sum(weight), 1)
     mean = statistics.mean + rate * (weight @ flat - statistics.mean)
     variance = statistics.variance + rate * (weight @ (flat - mean[None]) ** 2 - statistics.variance)

@@ -20,7 +20,7 @@ def of(windows: Window) -> Reading:
 
 
 def is_known(windows: Window) -> Bool[Array, "time batch"]:
-    """Whether the history before a timestep is known: the window continues another, or an episode began in it."""
+    """Whether a timestep can be learned from: its reader did not just jump, or an episode has begun since."""
     return of(windows).continues[None] | (jnp.cumsum(windows.step.is_first, axis=0) > 0)
 
 

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, Key
 
-from beliefrl.types import Reading, StoredTimestep, Timestep, Window, WindowShape
+from beliefrl.types import Reading, StoredTimestep, Timestep, UserError, Window, WindowShape
 
 
 class Replay(NamedTuple):
@@ -41,24 +41,34 @@ def add(replay: Replay, timestep: StoredTimestep, keep: Bool[Array, ""] | bool =
     return Replay(timesteps, replay.added + jnp.asarray(keep, replay.added.dtype))
 
 
+NOWHERE = -1  # a reader there jumps
+
+
 class Readers(NamedTuple):
     """Where each reader reads next."""
 
-    number: Int[Array, " reader"]  # running number of a timestep; -1 before the first window
+    number: Int[Array, " reader"]  # running number of a timestep; NOWHERE before the first window
     ring: Int[Array, " reader"]
     turn: Int[Array, ""]  # the reader whose turn is next
 
 
 def init_readers(shape: WindowShape) -> Readers | None:
-    """Readers before their first window; None if the windows are drawn at random."""
-    nowhere = jnp.full(shape.readers, -1)
-    return Readers(nowhere, jnp.zeros_like(nowhere), jnp.zeros((), int)) if shape.readers else None
+    """Readers before their first window; None if the windows are drawn at random.
+
+    Raises:
+        UserError: the windows have both readers and a burn-in.
+    """
+    if not shape.readers:
+        return None
+    if shape.burn_in:
+        raise UserError(f"burn_in={shape.burn_in} is impossible with readers: their windows have no burn-in.")
+    return Readers(jnp.full(shape.readers, NOWHERE, int), jnp.zeros(shape.readers, int), jnp.zeros((), int))
 
 
 def windows(
     replay: Replay, readers: Readers | None, key: Key[Array, ""], batch: int, shape: WindowShape
 ) -> tuple[Window, Readers | None]:
-    """`batch` windows, read by the next readers or drawn at random; also the readers after it."""
+    """`batch` windows, read by the next readers or drawn at random; also the readers after these windows."""
     if readers is None:
         return sample(replay, key, batch, shape), None
     return read(replay, readers, key, batch, shape)
@@ -67,28 +77,32 @@ def windows(
 def read(
     replay: Replay, readers: Readers, key: Key[Array, ""], batch: int, shape: WindowShape
 ) -> tuple[Window, Readers]:
-    """The windows of the next `batch` readers, leaves (time, batch, ...), and the readers after it.
+    """The windows of the next `batch` readers, leaves (time, batch, ...), and the readers after these windows.
 
     A reader continues where its last window ended. The last timestep of a window is the first of the next one, so
-    every transition is in one of them. It jumps to a place that `sample` could draw with the probability `shape.jump`,
-    if the replay does not yet have the whole next window, or if it no longer has it.
+    every transition is in one of them. With the probability `shape.jump` the reader jumps to a random place, from which
+    two windows are stored if a ring has so many. It must jump if its next window is not complete, or was overwritten.
+
+    Raises:
+        UserError: there are fewer readers than windows to read.
     """
+    if batch > shape.readers:
+        raise UserError(f"readers={shape.readers} is impossible: the agent reads {batch} windows at a time.")
     reader = (readers.turn + jnp.arange(batch)) % shape.readers
     key_place, key_jump = jax.random.split(key)
     number, of_ring = readers.number[reader], readers.ring[reader]
     oldest, added = span(replay, of_ring)
     stored = (number >= oldest) & (number + shape.length < added)
     continues = stored & ~jax.random.bernoulli(key_jump, shape.jump, (batch,))
-    place = places(replay, key_place, batch, shape.length)
+    place = places(replay, key_place, batch, 2 * shape.length)
     number, of_ring = (jnp.where(continues, *pair) for pair in zip((number, of_ring), place, strict=True))
     numbers = number[None] + jnp.arange(shape.length + 1)[:, None]
-    timesteps = gather(replay, numbers, of_ring[None])
+    timesteps, exists = gather(replay, numbers, of_ring[None]), numbers < span(replay, of_ring)[1][None]
     after = Readers(
-        readers.number.at[reader].set(numbers[-1]),
+        readers.number.at[reader].set(jnp.where(exists[-1], numbers[-1], NOWHERE)),
         readers.ring.at[reader].set(of_ring),
         (readers.turn + batch) % shape.readers,
     )
-    exists = numbers < span(replay, of_ring)[1][None]
     return Window(timesteps.step, timesteps.note, exists, Reading(reader, continues)), after
 
 

@@ -26,6 +26,7 @@ from beliefrl.training import initial, log
 from beliefrl.training.compilation import keep_compiled
 from beliefrl.training.evaluation import as_argument
 from beliefrl.training.phases import SeedState
+from beliefrl.training.replay import NOWHERE
 from beliefrl.training.schedule import Event, Phase, Snapshot, TrainingProgress, stages
 from beliefrl.training.stop import Requests, Stopped
 from beliefrl.types import UserError, cause
@@ -128,6 +129,9 @@ class Session:
         saved = found.tree.replay
         replay = saved._replace(timesteps=found.timesteps, added=saved.added - found.missing.astype(saved.added.dtype))
         seeds = found.tree._replace(replay=replay)
+        if seeds.readers is not None and found.missing.any():  # the timesteps are numbered anew
+            nowhere = np.full_like(seeds.readers.number, NOWHERE)
+            seeds = seeds._replace(readers=seeds.readers._replace(number=nowhere))
         return Snapshot(self.last, jax.tree.map(jnp.asarray, seeds))
 
     def _listen(self, event: Event) -> bool:
