@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from beliefrl.agents.predictive_sac import Note, PredictiveSACAgent
-from beliefrl.models import double_q
+from beliefrl.models import double_q, reading
 from beliefrl.models.double_q import Policy
 from beliefrl.models.nets import standardise
 from beliefrl.models.pool import draw
@@ -97,24 +97,25 @@ def test_a_window_that_continues_starts_from_the_state_at_the_end_of_the_last_on
     one = read(whole.between(0, TIME), False, reader)
     two = read(whole.between(TIME - 1, None), True, reader)
     first, _, _ = learn(state, one)
-    second, beliefs, _ = learn(first, two)
+    second, belief, _ = learn(first, two)
     before = jax.tree.map(lambda leaf: leaf[-2], unrolled(state._replace(scales=first.scales), one))
     kept = jax.tree.map(lambda leaf: leaf[jnp.array(reader)], first.readers)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), before, kept)
     np.testing.assert_array_equal(first.readers.d[jnp.array([0, 2, 4, 5])], 0.0)
     d = unrolled(first._replace(scales=second.scales), two, kept).d
-    np.testing.assert_allclose(beliefs.belief[..., : AGENT.d_size], d, rtol=1e-5, atol=1e-6)
-    assert beliefs.valid.all()
+    np.testing.assert_allclose(belief[..., : AGENT.d_size], d, rtol=1e-5, atol=1e-6)
+    assert reading.known_transitions(two).all()
 
 
 def test_after_a_jump_nothing_is_learned_until_an_episode_begins(state):
     first = jnp.zeros((2, TIME), bool).at[0, 3].set(True)
     window = noted(windows(jax.random.key(1), 2, TIME, first))
     full = state._replace(readers=jax.tree.map(jnp.ones_like, state.readers))
-    after, beliefs, metrics = jax.jit(AGENT.learn_model)(full, window)
-    np.testing.assert_array_equal(beliefs.valid, [[t >= 3, False] for t in range(TIME - 1)])
+    after, belief, metrics = jax.jit(AGENT.learn_model)(full, window)
+    in_pool = jax.jit(AGENT.begin_cycle)(full, window, jax.random.key(2))[0].pool.transitions.valid[0]
+    np.testing.assert_array_equal(in_pool.reshape(-1, 2), [[t >= 3, False] for t in range(TIME - 1)])
     d = unrolled(state._replace(scales=after.scales), window).d  # from zero
-    np.testing.assert_allclose(beliefs.belief[..., : AGENT.d_size], d, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(belief[..., : AGENT.d_size], d, rtol=1e-5, atol=1e-6)
     obs = window.step.obs.at[:3, 0].add(5.0).at[1:, 1].add(5.0)  # what is not learned from
     scaled = window._replace(step=window.step._replace(obs=obs))
     same_scales = full._replace(scales=full.scales._replace(obs=full.scales.obs._replace(batches=jnp.array(1e9))))
@@ -128,7 +129,7 @@ def test_a_belief_in_the_replay_remembers_rewards_from_before_its_window(state):
     rewards = window.note.rewards.at[:, 0].add(1.0)  # a reward before the window
     long_ago = window._replace(note=window.note._replace(rewards=rewards))
     learn = jax.jit(AGENT.learn_model)
-    plain, other = learn(state, window)[1].belief, learn(state, long_ago)[1].belief
+    plain, other = learn(state, window)[1], learn(state, long_ago)[1]
     d = AGENT.d_size
     assert (jnp.abs(plain - other)[:, 0, :d].max(axis=-1) > 1e-4).all()
     np.testing.assert_allclose(plain[..., d:], other[..., d:], rtol=1e-5)  # x_t has no memory
@@ -235,7 +236,7 @@ def test_traces_use_the_policy_noted_at_their_timestep(state, begun):
     window = window._replace(note=window.note._replace(policy=policy))
     agent, key = dataclasses.replace(AGENT, trace_decay=0.8, off_policy_trace=0.0), jax.random.key(2)
     after, _, _ = jax.jit(agent.begin_cycle)(state, window, key)
-    belief = jax.jit(agent.learn_model)(state, window)[1].belief
+    belief = jax.jit(agent.learn_model)(state, window)[1]
     valid, key = jnp.ones((6, 2), bool), jax.random.split(key)[0]
     given = standardise(after.scales.belief, belief), window.step, valid, policy, key, agent.gamma, 0.8, 0.0
     y, _ = jax.jit(lambda: double_q.targets(state.controller, *given))()

@@ -39,7 +39,7 @@ from beliefrl.models.pool import Pool
 from beliefrl.models.predictive_model import PredictiveModel, init_model, prediction_loss, remember
 from beliefrl.models.scales import Scales, initial_scales
 from beliefrl.models.soft_actor_critic import OptimiserState, valid_mean
-from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range, transitions
+from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range
 
 
 class Note(NamedTuple):
@@ -57,13 +57,6 @@ class Memory(NamedTuple):
 
     lstm: LSTMState
     note: Note  # on the last timestep
-
-
-class Beliefs(NamedTuple):
-    """The beliefs of windows, formed by the model before its update, and which transitions to learn from."""
-
-    belief: Float[Array, "time batch belief"]  # [h_t, x_t], not standardised
-    valid: Bool[Array, "length batch"]
 
 
 class State(NamedTuple):
@@ -248,12 +241,11 @@ class PredictiveSACAgent(ControllerAgent):
         usual = state.scales.usual.include(step.reward, windows.exists & ~step.is_first)
         return state._replace(scales=state.scales._replace(usual=usual)), metrics
 
-    def learn_model(self, state: State, windows: Window) -> tuple[State, Beliefs, Metrics]:
-        """One Adam step on J_model."""
+    def learn_model(self, state: State, windows: Window) -> tuple[State, Float[Array, "time batch belief"], Metrics]:
+        """One Adam step on J_model; also returns the beliefs, formed before the step and not standardised."""
         scales, step, after = state.scales.include(windows), windows.step, windows.between(1, None).step
-        x, known = scales.perception(step), reading.is_known(windows)
+        x, valid = scales.perception(step), reading.known_transitions(windows)
         inputs, start = scales.model_input(x, windows.note.rewards), reading.start(windows, state.readers)
-        valid = transitions(windows, 0) & known[:-1]
 
         def loss(model: PredictiveModel) -> tuple[Float[Array, ""], LSTMState]:
             lstm = model.lstm.unroll(start, inputs, step.is_first)
@@ -262,29 +254,30 @@ class PredictiveSACAgent(ControllerAgent):
         (j_model, lstm), gradient = jax.value_and_grad(loss, has_aux=True)(state.model)
         model, optimiser = descend(self.model_optimiser, gradient, state.model_optimiser, state.model)
         belief = jnp.concatenate([lstm.d, x], axis=-1)
-        scales = scales._replace(belief=update_statistics(scales.belief, belief, windows.exists & known))
+        known = windows.exists & reading.is_known(windows)
+        scales = scales._replace(belief=update_statistics(scales.belief, belief, known))
         readers = reading.end(windows, state.readers, lstm)
         state = state._replace(model=model, model_optimiser=optimiser, scales=scales, readers=readers)
-        return state, Beliefs(belief, valid), {"loss_model": j_model}
+        return state, belief, {"loss_model": j_model}
 
     # Learning the controller
 
     def begin_cycle(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Samples, Metrics]:
         """One update of the model; then a batch from the pool for each update of the controller."""
         key_targets, key_draw = jax.random.split(key)
-        state, beliefs, metrics = self.learn_model(state, windows)
-        samples, likeness = self.samples(state, windows, beliefs, key_targets)
+        state, belief, metrics = self.learn_model(state, windows)
+        samples, likeness = self.samples(state, windows, belief, key_targets)
         found = pool.add(state.pool, samples)
         batches = pool.draw(found, key_draw, (self.cycle, self.batch_size))
         batches = batches._replace(belief=standardise(state.scales.belief, batches.belief))
         return state._replace(pool=found), batches, metrics | {"likeness": likeness}
 
     def samples(
-        self, state: State, windows: Window, beliefs: Beliefs, key: Key[Array, ""]
+        self, state: State, windows: Window, belief: Float[Array, "time batch belief"], key: Key[Array, ""]
     ) -> tuple[Samples, Float[Array, ""]]:
         """The transitions of windows with their targets; also the mean of min(1, π / b)."""
-        belief, valid = beliefs
-        s, step, b = standardise(state.scales.belief, belief), windows.step, windows.note.policy
+        valid, s = reading.known_transitions(windows), standardise(state.scales.belief, belief)
+        step, b = windows.step, windows.note.policy
         discounts = self.gamma, self.trace_decay, self.off_policy_trace
         y, likeness = double_q.targets(state.controller, s, step, valid, b, key, *discounts)
         samples = Samples(belief[:-1], step.prev_action[1:], y, valid)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from beliefrl.models.nets import LSTMState
-from beliefrl.types import Reading, Window
+from beliefrl.types import Reading, Window, transitions
 
 
 def of(windows: Window) -> Reading:
@@ -22,6 +22,11 @@ def of(windows: Window) -> Reading:
 def is_known(windows: Window) -> Bool[Array, "time batch"]:
     """Whether a timestep can be learned from: its reader did not just jump, or an episode has begun since."""
     return of(windows).continues[None] | (jnp.cumsum(windows.step.is_first, axis=0) > 0)
+
+
+def known_transitions(windows: Window) -> Bool[Array, "length batch"]:
+    """Whether each pair of neighbouring timesteps is a transition to learn from."""
+    return transitions(windows, 0) & is_known(windows)[:-1]
 
 
 def start(windows: Window, states: LSTMState) -> LSTMState:
