@@ -285,6 +285,24 @@ def test_a_reader_jumps_from_timesteps_that_were_replaced():
         assert (numbers(window) >= 8).all()
 
 
+def test_readers_stay_at_their_timesteps_when_these_are_numbered_anew():
+    """As when a training with a full ring is resumed with a larger one."""
+    full = filled(16, np.zeros(24, bool))  # has the last 16 of 24
+    kept = ring.gather(full, jnp.arange(8, 24))
+    pad = functools.partial(jax.tree.map, lambda leaf: jnp.concatenate([leaf, jnp.zeros_like(leaf)]))
+    larger = ring.Replay(pad(kept), jnp.array(16))
+    readers = ring.init_readers(SHAPE)._replace(number=jnp.array([7, 8, 12, 19, 20, ring.NOWHERE]))
+    moved = ring.renumbered(readers, jnp.array(8))
+    for number in range(3):
+        (window, readers), (again, moved) = (
+            read(*pair, jax.random.key(number)) for pair in ((full, readers), (larger, moved))
+        )
+        expected = [[False, True], [True, True], [False, False]][number]
+        np.testing.assert_array_equal(window.reading.continues, expected)
+        jax.tree.map(np.testing.assert_array_equal, window, again)
+    np.testing.assert_array_equal(moved.number, readers.number - 8)
+
+
 def test_after_a_jump_another_window_follows():
     """If a ring has two windows; else the reader jumps to its oldest timestep."""
     for count, most in ((40, 40 - 1 - 2 * SHAPE.length), (8, 0), (6, 0)):

@@ -106,6 +106,14 @@ def read(
     return Window(timesteps.step, timesteps.note, exists, Reading(reader, continues)), after
 
 
+def renumbered(readers: Readers, missing: Int[Array, "*rings"]) -> Readers:
+    """The readers at the same timesteps, after each ring has lost its first `missing` timesteps and counts anew.
+
+    A reader of a lost timestep then has a negative number, so it jumps.
+    """
+    return readers._replace(number=readers.number - jnp.atleast_1d(missing)[readers.ring])
+
+
 def sample(replay: Replay, key: Key[Array, ""], batch: int, shape: WindowShape) -> Window:
     """Draw `batch` windows of burn_in + length + 1 timesteps, leaves (time, batch, ...).
 

@@ -23,10 +23,10 @@ from beliefrl.runs.options import Options
 from beliefrl.runs.run import Recorder, Run
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import initial, log
+from beliefrl.training import replay as ring
 from beliefrl.training.compilation import keep_compiled
 from beliefrl.training.evaluation import as_argument
 from beliefrl.training.phases import SeedState
-from beliefrl.training.replay import NOWHERE
 from beliefrl.training.schedule import Event, Phase, Snapshot, TrainingProgress, stages
 from beliefrl.training.stop import Requests, Stopped
 from beliefrl.types import UserError, cause
@@ -108,9 +108,9 @@ class Session:
 
     def restore(self, shapes: SeedState) -> Snapshot:
         """Restore the last undamaged checkpoint, and truncate the log to its length at that time."""
-        ring = shapes.replay
-        like = shapes._replace(replay=ring._replace(timesteps=()))
-        found = self.checkpoints.restore(like, ring.timesteps, RENAMED, axes=ring.added.ndim)
+        empty = shapes.replay
+        like = shapes._replace(replay=empty._replace(timesteps=()))
+        found = self.checkpoints.restore(like, empty.timesteps, RENAMED, axes=empty.added.ndim)
         for why in found.passed_over:
             self._report(Event(Phase.RESUMING, found.step, note=f"{why} The checkpoint before it is used."))
         self.recorder.rewind({int(seed): length for seed, length in found.progress["metrics"].items()})
@@ -129,9 +129,8 @@ class Session:
         saved = found.tree.replay
         replay = saved._replace(timesteps=found.timesteps, added=saved.added - found.missing.astype(saved.added.dtype))
         seeds = found.tree._replace(replay=replay)
-        if seeds.readers is not None and found.missing.any():  # the timesteps are numbered anew
-            nowhere = np.full_like(seeds.readers.number, NOWHERE)
-            seeds = seeds._replace(readers=seeds.readers._replace(number=nowhere))
+        if seeds.readers is not None:
+            seeds = seeds._replace(readers=jax.vmap(ring.renumbered)(seeds.readers, found.missing))
         return Snapshot(self.last, jax.tree.map(jnp.asarray, seeds))
 
     def _listen(self, event: Event) -> bool:
