@@ -27,7 +27,7 @@ from beliefrl.training import host_loop as loop
 from beliefrl.training import phases
 from beliefrl.training.bench import Noise
 
-NAMES = ("vrm", "sac-mlp", "sac-lstm", "slac")
+NAMES = ("vrm", "predictive-sac", "sac-mlp", "sac-lstm", "slac")
 
 # host-loop
 
@@ -58,6 +58,7 @@ def host_loop(
     actions: int = 3,
     seeds: int = 1,
     rounds: int = 9,
+    capacity: int = 125_000,
 ) -> None:
     """Compare the time of a step of the host loop and of the compiled loop, without the time of the environment.
 
@@ -70,15 +71,15 @@ def host_loop(
         actions: size of the action.
         seeds: seeds that train at the same time.
         rounds: how often both are timed.
+        capacity: timesteps that the replay has room for.
     """
     loop.keep_memory()  # as on the command line
     environment = GymnasiumTask(NoiseEnvironment, "noise", {"obs": obs, "actions": actions}, max_steps=1000)
     keys = jax.random.split(jax.random.key(0), seeds)
-    print(f"{'agent':<10}{'compiled':>10}{'host':>10}{'ratio':>8}   ms/step without the environment; {seeds} seeds")
+    print(f"{'agent':<16}{'compiled':>10}{'host':>10}{'ratio':>8}   ms/step without the environment; {seeds} seeds")
     for name in names:
         agent = agents.make(name)
         stretch = phases.stretch_length(agent)
-        capacity = 4 * stretch * (rounds + 2)
         programs = (
             phases.compile_program(agent, Noise(obs, actions), capacity, 1),
             loop.program(agent, environment, capacity, 1, range(seeds), "never"),
@@ -93,7 +94,7 @@ def host_loop(
                 seconds = time.perf_counter() - before - NoiseEnvironment.spent
                 times[index].append(1e3 * seconds / stretch)
         compiled, host = (statistics.median(each[1:]) for each in times)  # the first compiles
-        print(f"{name:<10}{compiled:>10.2f}{host:>10.2f}{host / compiled:>8.3f}", flush=True)
+        print(f"{name:<16}{compiled:>10.2f}{host:>10.2f}{host / compiled:>8.3f}", flush=True)
         programs[1].close()
 
 

@@ -1,11 +1,12 @@
-"""Train VRM on the pendulum, observing only the angular velocity, and evaluate the result.
+"""Train predictive SAC on the pendulum, observing only the angular velocity, and evaluate the result.
 
     pip install -c constraints.txt -e .           # in a clone of the repository
-    python examples/00_quick_start.py             # 15,000 steps, three seeds: 15 to 30 minutes on two cores
-    python examples/00_quick_start.py --quick     # 600 steps, one seed, to see it run: 52 s of CPU time
+    python examples/00_quick_start.py             # 6,000 steps, three seeds: MINUTES on two cores
+    python examples/00_quick_start.py --quick     # 1,200 steps, one seed, to see it run: SECONDS s of CPU time
 
 The return of an episode is about -1200 for a random policy, and -150 if the pendulum is swung up and held. Each start
-makes a new folder, runs/vrm-pendulum-v-1 and so on.
+makes a new folder, runs/predictive-sac-pendulum-v-1 and so on. For the paper's agent, replace the name by "vrm" and the
+number of steps by 15,000.
 """
 
 import tyro
@@ -14,12 +15,9 @@ import beliefrl
 
 
 def main(quick: bool = False) -> None:
-    """Train three seeds side by side, and play new episodes with the trained agents."""
-    if quick:
-        agent = beliefrl.make_agent("vrm", models="keep", step_start_rl=300)  # without pre-training
-        run = beliefrl.train(agent, "pendulum-v", steps=600)
-    else:
-        run = beliefrl.train("vrm", "pendulum-v", steps=15_000, seeds=3)
+    """Train seeds side by side, and play new episodes with the trained agents."""
+    steps, seeds = (1_200, 1) if quick else (6_000, 3)
+    run = beliefrl.train("predictive-sac", "pendulum-v", steps=steps, seeds=seeds)
 
     results = beliefrl.evaluate(run, episodes=20)
     for mode in ("sampled", "mode"):

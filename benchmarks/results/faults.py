@@ -5,7 +5,7 @@
     python benchmarks/results/faults.py --draw results/faults.json.gz
 
 The trainings are a sweep in runs/faults: a stopped one goes on with the same command. The files are
-results/faults.json.gz and docs/results/faults.png, and a table in Markdown is printed. With --quick, all files are in
+results/faults.json.gz and docs/results/faults/returns.png, and a table in Markdown is printed. With --quick, all files are in
 the sweep's folder. The share that an agent keeps is 100 % for its return without faults, and 0 % for that of a random
 policy.
 """
@@ -93,7 +93,7 @@ def main():
     parser.add_argument("--draw", type=pathlib.Path, default=None, help="draw a file of results, and train nothing")
     given = parser.parse_args()
     out = given.out or pathlib.Path("runs/faults-quick" if given.quick else "runs/faults")
-    results_file, picture = pathlib.Path("results/faults.json.gz"), pathlib.Path("docs/results/faults.png")
+    results_file, picture = pathlib.Path("results/faults.json.gz"), pathlib.Path("docs/results/faults/returns.png")
     if given.quick:
         results_file, picture = out / results_file.name, out / picture.name
     if given.draw is None:

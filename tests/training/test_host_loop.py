@@ -57,6 +57,26 @@ class Wrapped(gymnasium.Env):
         return np.asarray(obs), float(reward), *end, self._measures()
 
 
+CAPACITY = 4321  # no other array has this size
+
+
+@pytest.mark.slow
+def test_no_step_copies_the_replay():
+    """A copy takes longer than the updates if the replay is large."""
+    agent = agents.make("sac-mlp", **SMALL["sac-mlp"])
+    task = GymnasiumTask(lambda: Wrapped(Hanging()), max_steps=200)
+    program = host_loop.program(agent, task, CAPACITY, 1, [0], "never")
+    seeds = program.begin(jax.random.split(jax.random.key(0), 1))
+    program.explore(seeds, 0, 0)
+    program.learn(seeds, 0, 0)
+    loop = program.learn.__self__
+    for compiled in (loop._go_on, loop._learn):
+        lines = [line for line in compiled.as_text().splitlines() if str(CAPACITY) in line]
+        assert lines
+        assert not [line for line in lines if " copy(" in line]
+    program.close()
+
+
 @pytest.mark.parametrize(
     "name", [pytest.param("sac-mlp", marks=pytest.mark.slow), pytest.param("vrm", marks=pytest.mark.nightly)]
 )

@@ -241,18 +241,29 @@ def _act(agent: Agent, envs: int, seed: SeedState, step: Int[Array, ""]) -> Acto
 def _record(
     agent: Agent, spec: Spec, envs: int, seed: SeedState, result: StepResult, step: Int[Array, ""]
 ) -> tuple[SeedState, Episode]:
-    """Record the results of this step."""
+    """Record the results of this step.
 
-    def record(actor: ActorState, replay: Replay, result: StepResult, key: Key[Array, ""]):
-        _, key_last, _ = jax.random.split(key, 3)
+    The replay is written in a loop whose length XLA does not know: else XLA copies the whole ring (`phases._round`).
+    """
+
+    def arrive(actor: ActorState, result: StepResult) -> ActorState:
         action, memory = result.output
-        after = rollout.arrive(actor, memory, action, (), result.obs, result.reward, result.terminated)
-        fresh = rollout.first(agent, spec, (), result.fresh)
-        episode = Episode(result.done, after.episode_return, after.length, result.measures)
-        return *rollout.record(agent, seed.state, replay, actor, after, fresh, result.done, key_last), episode
+        return rollout.arrive(actor, memory, action, (), result.obs, result.reward, result.terminated)
 
-    keys = phases.acting_keys(seed.key, step, envs)
-    actor, replay, episode = phases.on_each_env(envs, record)(seed.actor, seed.replay, result, keys)
+    def record(
+        replay: Replay, actor: ActorState, after: ActorState, result: StepResult, key: Key[Array, ""]
+    ) -> tuple[ActorState, Replay]:
+        _, key_last, _ = jax.random.split(key, 3)
+        fresh = rollout.first(agent, spec, (), result.fresh)
+        return rollout.record(agent, seed.state, replay, actor, after, fresh, result.done, key_last)
+
+    def once(_, carry):
+        actor, replay = carry
+        return phases.on_each_env(envs, record)(replay, actor, after, result, keys)
+
+    keys, after = phases.acting_keys(seed.key, step, envs), phases.on_each_env(envs, arrive)(seed.actor, result)
+    actor, replay = jax.lax.fori_loop(step, step + 1, once, (seed.actor, seed.replay))
+    episode = Episode(result.done, after.episode_return, after.length, result.measures)
     return seed._replace(actor=actor, replay=replay), episode
 
 
