@@ -1,8 +1,8 @@
 """Train predictive SAC on the pendulum, observing only the angular velocity, and evaluate the result.
 
     pip install -c constraints.txt -e .           # in a clone of the repository
-    python examples/00_quick_start.py             # 6,000 steps, three seeds: MINUTES on two cores
-    python examples/00_quick_start.py --quick     # 1,200 steps, one seed, to see it run: SECONDS s of CPU time
+    python examples/00_quick_start.py             # 6,000 steps, three seeds: one to two minutes on two cores
+    python examples/00_quick_start.py --quick     # 1,200 steps, one seed, to see it run: 33 s of CPU time
 
 The return of an episode is about -1200 for a random policy, and -150 if the pendulum is swung up and held. Each start
 makes a new folder, runs/predictive-sac-pendulum-v-1 and so on. For the paper's agent, replace the name by "vrm" and the

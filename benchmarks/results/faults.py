@@ -5,9 +5,9 @@
     python benchmarks/results/faults.py --draw results/faults.json.gz
 
 The trainings are a sweep in runs/faults: a stopped one goes on with the same command. The files are
-results/faults.json.gz and docs/results/faults/returns.png, and a table in Markdown is printed. With --quick, all files are in
-the sweep's folder. The share that an agent keeps is 100 % for its return without faults, and 0 % for that of a random
-policy.
+results/faults.json.gz and docs/results/faults/returns.png, and a table in Markdown is printed. With --quick, all files
+are in the sweep's folder. The share that an agent keeps is 100 % for its return without faults, and 0 % for that of a
+random policy.
 """
 
 import argparse

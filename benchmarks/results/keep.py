@@ -7,8 +7,8 @@
 files of results. Runs that are already in the file stay there. If a run is given again, for example after more steps,
 it replaces its earlier version. The format of the file is described in `beliefrl.analysis.results`.
 
-`demo` packs an agent for `beliefrl demo`. docs/results/README.md has the commands that train the agents. Each seed of RUN
-plays 100 episodes. The seed with the highest mean return (mode actions) is packed into the package, as a run of its
+`demo` packs an agent for `beliefrl demo`. docs/results/README.md has the commands that train the agents. Each seed of
+RUN plays 100 episodes. The seed with the highest mean return (mode actions) is packed into the package, as a run of its
 own. It plays 100 further episodes; their returns and those of all seeds are in its results.json.
 """
 

@@ -130,7 +130,7 @@ class Session:
         replay = saved._replace(timesteps=found.timesteps, added=saved.added - found.missing.astype(saved.added.dtype))
         seeds = found.tree._replace(replay=replay)
         if seeds.readers is not None:
-            seeds = seeds._replace(readers=jax.vmap(ring.renumbered)(seeds.readers, found.missing))
+            seeds = seeds._replace(readers=jax.vmap(ring.renumbered)(seeds.readers, jnp.asarray(found.missing)))
         return Snapshot(self.last, jax.tree.map(jnp.asarray, seeds))
 
     def _listen(self, event: Event) -> bool:
