@@ -251,15 +251,14 @@ def _record(
         return rollout.arrive(actor, memory, action, (), result.obs, result.reward, result.terminated)
 
     def record(
-        replay: Replay, actor: ActorState, after: ActorState, result: StepResult, key: Key[Array, ""]
+        actor: ActorState, replay: Replay, after: ActorState, result: StepResult, key: Key[Array, ""]
     ) -> tuple[ActorState, Replay]:
         _, key_last, _ = jax.random.split(key, 3)
         fresh = rollout.first(agent, spec, (), result.fresh)
         return rollout.record(agent, seed.state, replay, actor, after, fresh, result.done, key_last)
 
     def once(_, carry):
-        actor, replay = carry
-        return phases.on_each_env(envs, record)(replay, actor, after, result, keys)
+        return phases.on_each_env(envs, record)(*carry, after, result, keys)
 
     keys, after = phases.acting_keys(seed.key, step, envs), phases.on_each_env(envs, arrive)(seed.actor, result)
     actor, replay = jax.lax.fori_loop(step, step + 1, once, (seed.actor, seed.replay))
