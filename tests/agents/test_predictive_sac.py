@@ -268,12 +268,12 @@ def test_the_controller_sends_no_gradient_into_the_model(state, begun):
 
 
 def test_what_is_evaluated_is_an_average_of_the_last_weights(state, begun):
-    """The first update replaces the average; from then on it follows at its rate, but at least as a plain mean."""
+    """The first update replaces the average. Then it follows at 10 / (n + 9), or at its rate if that is more."""
     moved = jax.tree.map(lambda leaf: leaf + 1.0, state.average.weights)
     assert same(
         AGENT.networks(state._replace(average=state.average._replace(weights=moved))).model, state.model
     )  # before the first update
-    agent = dataclasses.replace(AGENT, average_rate=0.4)
+    agent = dataclasses.replace(AGENT, average_rate=0.8)
     begin, update, weights = jax.jit(agent.begin_cycle), jax.jit(agent.update), []
     for number in range(4):
         window = noted(windows(jax.random.key(number), 2, TIME))
@@ -281,7 +281,7 @@ def test_what_is_evaluated_is_an_average_of_the_last_weights(state, begun):
         state, _ = update(state, jax.tree.map(lambda leaf: leaf[0], batches), jax.random.key(number))
         weights.append((state.model.lstm.w_d, state.controller.actor.network.layers[0].weight))
     expected = weights[0]
-    for rate, newest in zip((1 / 2, 0.4, 0.4), weights[1:], strict=True):
+    for rate, newest in zip((10 / 11, 10 / 12, 0.8), weights[1:], strict=True):
         expected = [old + rate * (new - old) for old, new in zip(expected, newest, strict=True)]
     trained = agent.networks(state)
     found = trained.model.lstm.w_d, trained.controller.actor.network.layers[0].weight

@@ -129,9 +129,9 @@ class PredictiveSACAgent(ControllerAgent):
     rewards are unusual."""
     pool: int = 8
     """Number of the last cycles whose transitions are in the pool."""
-    average_rate: float = 2e-3
-    """Rate of the running average of the weights that is evaluated and saved, in (0, 1]. With 1, the newest weights are
-    evaluated."""
+    average_rate: float = 2e-4
+    """Smallest rate of the running average of the weights that is evaluated and saved, in (0, 1]. After n updates the
+    rate is at least 10 / (n + 9). With 1, the newest weights are evaluated."""
 
     ranges = ControllerAgent.ranges | {
         "batch_size": (64, 128, 256, 512),

@@ -1,8 +1,9 @@
 """A running average of weights, which changes more slowly than the weights (Polyak and Juditsky 1992).
 
-    w̄ = w̄ + ρ (w - w̄),   ρ = max(rate, 1 / number of the update)
+    w̄ = w̄ + ρ (w - w̄),   ρ = max(rate, 10 / (n + 9)),   n is the number of the update
 
-So it is the plain mean of the first 1 / rate weights, and then an exponential average.
+At first it is an average over about the last tenth of the updates (polynomial-decay averaging with η = 9, Shamir and
+Zhang 2013). After 10 / rate updates it is an exponential average.
 """
 
 from typing import Any, NamedTuple
@@ -12,6 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from beliefrl.models.soft_actor_critic import soft_update
+
+PARTS = 10  # at first the average is over about the last 1 / PARTS of the updates
 
 
 class Average(NamedTuple):
@@ -29,7 +32,8 @@ def begin(weights: Any) -> Average:
 def follow(average: Average, newest: Any, rate: float) -> Average:
     """The average after one more update of the weights."""
     updates = average.updates + 1
-    return Average(soft_update(average.weights, newest, jnp.maximum(rate, 1 / updates)), updates)
+    rho = jnp.maximum(rate, PARTS / (updates + PARTS - 1))
+    return Average(soft_update(average.weights, newest, rho), updates)
 
 
 def averaged(average: Average, newest: Any) -> Any:
