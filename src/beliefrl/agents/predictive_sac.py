@@ -28,14 +28,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents.base import ControllerAgent, Metrics, Range
-from beliefrl.models import average, double_q, others, pool, reading
+from beliefrl.models import average, double_q, pool, reading
 from beliefrl.models.average import Average
 from beliefrl.models.double_q import DoubleQController, Policy, Samples
 from beliefrl.models.nets import LSTMState, descend, standardise, update_statistics
-from beliefrl.models.others import Other
 from beliefrl.models.pool import Pool
 from beliefrl.models.predictive_model import PredictiveModel, init_model, prediction_loss, remember
 from beliefrl.models.scales import Scales, initial_scales
@@ -58,7 +57,6 @@ class Memory(NamedTuple):
 
     lstm: LSTMState
     note: Note  # on the last timestep
-    who: Int[Array, ""]  # the controller that acts in this episode (`models.others`)
 
 
 class State(NamedTuple):
@@ -72,7 +70,6 @@ class State(NamedTuple):
     model_optimiser: optax.OptState
     controller_optimiser: OptimiserState
     average: Average  # of the model and the actor
-    others: tuple[Other, ...]  # controllers with the discounts `other_gammas`
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,9 +93,6 @@ class PredictiveSACAgent(ControllerAgent):
     """Adam's learning rate for both Q."""
     lr_alpha: float = 2e-3
     """Adam's learning rate for log α, the temperature."""
-    other_gammas: tuple[float, ...] = ()
-    """Discounts of further controllers. In each training episode one of all controllers acts, drawn at random. Only the
-    one with `gamma` is evaluated and saved."""
     alpha_start: float = 0.1
     """α before training, in units of the returns."""
     tau: float = 0.02
@@ -160,8 +154,6 @@ class PredictiveSACAgent(ControllerAgent):
         check_range(self, ("lr_model", "jump", "long_memories", "trace_decay", "off_policy_trace"), 0, 1)
         check_range(self, ("average_rate",), 1e-6, 1)
         check_range(self, ("reward_memory",), 1)
-        if self.other_gammas:
-            check_range(self, ("other_gammas",), 0, 1)
 
     # How it is trained
 
@@ -191,22 +183,16 @@ class PredictiveSACAgent(ControllerAgent):
         model = init_model(key_model, *sizes, self.d_size, self.hidden_size, self.long_memories, self.longest_memory)
         belief = self.d_size + spec.obs_dim + spec.action_dim + 1
         layers = self.policy_layers, self.value_layers
-
-        def controller_from(key: Key[Array, ""]) -> DoubleQController:
-            return double_q.init_controller(key, belief, spec.action_dim, *layers, self.alpha_start)
-
-        controller, more = controller_from(key_controller), len(self.other_gammas)
-        further = [controller_from(jax.random.fold_in(key_controller, number)) for number in range(more)]
+        controller = double_q.init_controller(key_controller, belief, spec.action_dim, *layers, self.alpha_start)
         return State(
             model,
             controller,
             initial_scales(spec.obs_dim, belief),
             model.lstm.start(self.window.readers),
-            pool.empty((self.pool, self.sequences * self.seq_len), belief, spec.action_dim, more),
+            pool.empty((self.pool, self.sequences * self.seq_len), belief, spec.action_dim),
             self.model_optimiser.init(model),  # pyright: ignore[reportArgumentType]
             double_q.init_optimisers(self.optimisers, controller),
             average.begin((model, controller.actor)),
-            tuple(others.init(each, controller.actor, self.optimisers) for each in further),
         )
 
     def networks(self, state: State) -> State:
@@ -223,7 +209,6 @@ class PredictiveSACAgent(ControllerAgent):
             model_optimiser=(),
             controller_optimiser=(),
             average=(),
-            others=(),
         )
 
     # Acting
@@ -231,7 +216,7 @@ class PredictiveSACAgent(ControllerAgent):
     def reset(self, spec: Spec) -> Memory:
         empty = LSTMState(jnp.zeros(self.d_size), jnp.zeros(self.d_size))
         policy = Policy(jnp.zeros(spec.action_dim), jnp.zeros(spec.action_dim))
-        return Memory(empty, Note(jnp.zeros(len(self.reward_memory)), policy), jnp.zeros((), int))
+        return Memory(empty, Note(jnp.zeros(len(self.reward_memory)), policy))
 
     def act(
         self, state: State, memory: Memory, step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]
@@ -242,11 +227,8 @@ class PredictiveSACAgent(ControllerAgent):
         rewards = remember(memory.note.rewards, excess, self.reward_memory)
         lstm = state.model.next_state(memory.lstm, scales.model_input(x, rewards), step.is_first)
         belief = standardise(scales.belief, jnp.concatenate([lstm.d, x]))
-        policy, who = state.controller.actor(belief), memory.who
-        if state.others:
-            who = others.who_acts(jax.random.fold_in(key, 0), state.others, step.is_first, who)
-            policy = others.policy_of(who, policy, state.others, belief)
-        return self.choose_from(policy, key, explore), Memory(lstm, Note(rewards, policy), who)
+        policy = state.controller.actor(belief)
+        return self.choose_from(policy, key, explore), Memory(lstm, Note(rewards, policy))
 
     def note(self, memory: Memory) -> Note:
         return memory.note
@@ -296,23 +278,21 @@ class PredictiveSACAgent(ControllerAgent):
         """The transitions of windows with their targets; also the mean of min(1, π / b)."""
         valid, s = reading.known_transitions(windows), standardise(state.scales.belief, belief)
         step, b = windows.step, windows.note.policy
-
-        def targets(controller: DoubleQController, gamma: float) -> tuple[Array, Array]:
-            discounts = gamma, self.trace_decay, self.off_policy_trace
-            return double_q.targets(controller, s, step, valid, b, key, *discounts)
-
-        y, likeness = targets(state.controller, self.gamma)
-        pairs = zip(state.others, self.other_gammas, strict=True)
-        other_targets = tuple(targets(other.controller, gamma)[0] for other, gamma in pairs)
-        samples = Samples(belief[:-1], step.prev_action[1:], y, valid, other_targets)
+        discounts = self.gamma, self.trace_decay, self.off_policy_trace
+        y, likeness = double_q.targets(state.controller, s, step, valid, b, key, *discounts)
+        samples = Samples(belief[:-1], step.prev_action[1:], y, valid)
         return samples, valid_mean(likeness.ravel(), valid.ravel())
 
     def update(self, state: State, batch: Samples, key: Key[Array, ""]) -> tuple[State, Metrics]:
-        settings = self.tau, self.actor_regulariser, self.target_entropy
         controller, optimiser, metrics = double_q.update(
-            self.optimisers, state.controller_optimiser, state.controller, batch, key, *settings
+            self.optimisers,
+            state.controller_optimiser,
+            state.controller,
+            batch,
+            key,
+            self.tau,
+            self.actor_regulariser,
+            self.target_entropy,
         )
         followed = average.follow(state.average, (state.model, controller.actor), self.average_rate)
-        further = others.update(state.others, self.optimisers, batch, key, *settings)
-        learned = {"controller": controller, "controller_optimiser": optimiser, "average": followed, "others": further}
-        return state._replace(**learned), metrics
+        return state._replace(controller=controller, controller_optimiser=optimiser, average=followed), metrics

@@ -63,7 +63,6 @@ class Samples(NamedTuple):
     action: Float[Array, "*batch action"]  # a_t
     target: Float[Array, "*batch"]  # y_t
     valid: Bool[Array, "*batch"]  # mask: False entries are ignored
-    other_targets: tuple[Float[Array, "*batch"], ...] = ()  # y_t with other discounts (`others`)
 
 
 class OneTrunkActor(eqx.Module):

@@ -19,18 +19,13 @@ class Pool(NamedTuple):
     cycles: Int[Array, ""]  # so far
 
 
-def empty(room: tuple[int, int], belief: int, action: int, others: int = 0) -> Pool:
-    """A pool with room for so many cycles of so many transitions.
-
-    It needs the sizes of beliefs and actions, and the number of other targets.
-    """
+def empty(room: tuple[int, int], belief: int, action: int) -> Pool:
+    """A pool with room for so many cycles of so many transitions, given the sizes of beliefs and actions."""
 
     def zeros(*shape: int) -> Float[Array, "cycles transitions *shape"]:
         return jnp.zeros((*room, *shape))
 
-    samples = Samples(
-        zeros(belief), zeros(action), zeros(), zeros().astype(bool), tuple(zeros() for _ in range(others))
-    )
+    samples = Samples(zeros(belief), zeros(action), zeros(), zeros().astype(bool))
     return Pool(samples, jnp.zeros((), int))
 
 
