@@ -1,8 +1,9 @@
-"""How fast trainings run: in the compiled loop and the host loop, with several environments, with a program per core.
+"""How fast trainings run: in both loops, with several environments, with a program per core, with rounded products.
 
     python benchmarks/throughput.py host-loop          # the host loop and the compiled loop
     python benchmarks/throughput.py envs               # a slow Gymnasium environment, by the number of environments
     python benchmarks/throughput.py cores [AGENT ...]  # one program on all cores, and one per core
+    python benchmarks/throughput.py precision [AGENT ...]  # products in float32 and in bfloat16
 
 `--help` after one of these words describes what is measured, and its options.
 """
@@ -185,5 +186,41 @@ def cores(names: tyro.conf.Positional[tuple[str, ...]] = NAMES) -> None:
         print(f"{agent}: {statistics.median(ratios):.2f} times the throughput of one (median of {REPEATED})")
 
 
+# precision
+
+
+def precision(names: tyro.conf.Positional[tuple[str, ...]] = NAMES, seeds: int = 1, rounds: int = 9) -> None:
+    """Compare the time of a training step with `--precision float32` and with `--precision bfloat16`.
+
+    Both train in turn, at the sizes of velocities-only Hopper. Prints medians in milliseconds per step, and the median
+    ratio of two times that were measured one after the other.
+
+    Args:
+        names: the agents.
+        seeds: seeds that train at the same time.
+        rounds: how often both are timed.
+    """
+    keys = jax.random.split(jax.random.key(0), seeds)
+    print(f"{'agent':<16}{'float32':>10}{'bfloat16':>10}{'ratio':>8}   ms/step; {seeds} seeds")
+    for name in names:
+        agent, times = agents.make(name), []
+        stretch = phases.stretch_length(agent)
+        program = phases.compile_program(agent, Noise(6, 3), 125_000, 1)
+        states = [program.explore(program.begin(keys), 0, stretch)[0] for _ in range(2)]
+        for number in range(rounds + 1):
+            both = []
+            for index, kind in enumerate(("float32", "bfloat16")):
+                with jax.default_matmul_precision(kind):
+                    before, first = time.perf_counter(), stretch * (number + 1)
+                    states[index] = jax.block_until_ready(
+                        program.learn(states[index], first, stretch // agent.cycle)[0]
+                    )
+                both.append(1e3 * (time.perf_counter() - before) / stretch)
+            times.append(both)
+        single, rounded = (statistics.median(each) for each in zip(*times[1:], strict=True))  # the first compiles
+        ratio = statistics.median(b / a for a, b in times[1:])
+        print(f"{name:<16}{single:>10.2f}{rounded:>10.2f}{ratio:>8.3f}", flush=True)
+
+
 if __name__ == "__main__":
-    tyro.extras.subcommand_cli_from_dict({"host-loop": host_loop, "envs": envs, "cores": cores})
+    tyro.extras.subcommand_cli_from_dict({"host-loop": host_loop, "envs": envs, "cores": cores, "precision": precision})

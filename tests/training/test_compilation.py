@@ -137,7 +137,7 @@ def test_a_setting_of_the_users_own_wins(tmp_path, unset):
 AGENT = tiny("sac-mlp", step_start_rl=10, pretrain_updates=2, batch_size=4)
 OPTIONS = {"steps": 20, "eval_every": 20, "eval_episodes": 1, "track": ()}
 PHASES = ("explore", "pretrain", "learn", "evaluate")
-ASKED = {"float32": "HIGHEST", "tensorfloat32": "HIGH"}  # of XLA
+ASKED = {"float32": "HIGHEST", "tensorfloat32": "HIGH", "bfloat16": "DEFAULT"}  # of XLA
 
 
 def asked(text):

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import tyro
 
 from beliefrl.commands.arguments import agent_name, agent_options, parse
+from beliefrl.runs.options import Precision
 
 STARTED = time.time()
 
@@ -25,16 +26,17 @@ def bench(argv: Sequence[str]) -> None:
         "obs": option(int, 6, "Size of the observation; the default is that of velocities-only Hopper."),
         "actions": option(int, 3, "Size of the action; the default is that of Hopper."),
         "seeds": option(int, 1, "Seeds trained side by side in one program."),
+        "precision": option(Precision, "float32", "Precision of matrix products, as in a training."),
         "json": option(bool, False, "Print one JSON object."),
     }
     options = parse(agent_options(None if name == "all" else agents.find(name), own), rest, f"beliefrl bench {name}")
     from beliefrl.training.bench import bench as run_bench
 
-    sizes = (options.obs, options.actions, options.seeds)
+    given = (options.obs, options.actions, options.seeds, options.precision)
     if name == "all":
-        results = {each: run_bench(agents.make(each), *sizes) for each in agents.AGENTS}
+        results = {each: run_bench(agents.make(each), *given) for each in agents.AGENTS}
     else:
-        results = run_bench(options.agent, *sizes, STARTED)
+        results = run_bench(options.agent, *given, STARTED)
     if options.json:
         print(json.dumps(results))
     elif name == "all":

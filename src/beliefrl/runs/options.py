@@ -9,7 +9,7 @@ from beliefrl.types import LARGEST, UserError, check_choice, check_range
 MOST_EPISODES = 100_000  # they run in parallel
 MOST_SECONDS = 1_000_000
 Processes = Literal["auto", "always", "never"]
-Precision = Literal["float32", "tensorfloat32"]  # names in JAX
+Precision = Literal["float32", "tensorfloat32", "bfloat16"]  # names in JAX
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,8 +55,9 @@ class Options:
     keep_checkpoints: int = 2
     """Number of the latest checkpoints that are kept."""
     precision: Precision = "float32"
-    """Precision of matrix products: float32 or tensorfloat32. With tensorfloat32, an NVIDIA GPU (Ampere or later) may
-    round the factors to 10 bits of mantissa, which is faster. A CPU always computes in float32."""
+    """Precision of matrix products: float32, tensorfloat32 or bfloat16. With tensorfloat32, an NVIDIA GPU (Ampere or
+    later) may round the factors to 10 bits of mantissa, which is faster. A CPU then computes in float32. With bfloat16,
+    the factors of large products in the updates are rounded to 7 bits, also on a CPU."""
     track: tuple[Literal["tensorboard", "wandb"], ...] = ("tensorboard",)
     """Trackers that receive the logged numbers, besides the run's own log: tensorboard, wandb, both, or none. wandb
     needs the extra `wandb`, and is offline unless WANDB_MODE is set."""

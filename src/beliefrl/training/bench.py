@@ -19,8 +19,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents import Agent
+from beliefrl.runs.options import Precision
 from beliefrl.training import phases
 from beliefrl.training import replay as ring
+from beliefrl.training.rounding import at_precision
 from beliefrl.training.schedule import Options, capacity
 from beliefrl.types import Spec, UserError, check_range
 
@@ -101,13 +103,21 @@ class _Timed:
         return time.perf_counter() - before
 
 
-def bench(agent: Agent, obs: int, actions: int, seeds: int = 1, started: float | None = None) -> dict[str, Any]:
+def bench(
+    agent: Agent,
+    obs: int,
+    actions: int,
+    seeds: int = 1,
+    precision: Precision = Options.precision,
+    started: float | None = None,
+) -> dict[str, Any]:
     """Time an agent's training with observations and actions of these sizes, `seeds` of them in one program.
 
     Args:
         agent: the agent with its hyperparameters.
         obs, actions: sizes of the task's observation and action.
         seeds: all times are for a step of all seeds together.
+        precision: of matrix products, as in a training.
         started: `time.time()` at which the program began, for `first_training_step_s`.
 
     Returns:
@@ -116,12 +126,13 @@ def bench(agent: Agent, obs: int, actions: int, seeds: int = 1, started: float |
         program's start to the end of the first cycle of learning, with exploration and pre-training shortened to one
         block); compile_s, its part for compilation; matmul_gflops; gflop_per_step, of the updates' matrix products that
         are executed (`_flop`); share_of_peak, the rate of gflop_per_step in the loop divided by matmul_gflops;
-        parameters of one seed; obs, actions, seeds.
+        parameters of one seed; obs, actions, seeds, precision, device.
     """
     if not 1 <= seeds <= 2 * PAPER_STEPS:
         raise UserError(f"seeds={seeds} is impossible: it must be from 1 to {2 * PAPER_STEPS}.")
-    with jax.default_matmul_precision(Options.precision):  # the default of a training
-        return _bench(agent, obs, actions, seeds, time.time() if started is None else started)
+    with jax.default_matmul_precision(Options(precision=precision).precision):  # checked there
+        measured = _bench(agent, obs, actions, seeds, time.time() if started is None else started)
+    return measured | {"precision": precision, "device": str(jax.devices()[0].device_kind)}
 
 
 def _bench(agent: Agent, obs: int, actions: int, seeds: int, started: float) -> dict[str, Any]:
@@ -152,7 +163,6 @@ def _bench(agent: Agent, obs: int, actions: int, seeds: int, started: float) -> 
         "obs": obs,
         "actions": actions,
         "seeds": seeds,
-        "device": str(jax.devices()[0].device_kind),
     }
 
 
@@ -176,9 +186,9 @@ def _update_parts(agent: Agent, timed: _Timed) -> tuple[dict[str, float], float]
 
     # If only the state is an output, XLA removes the beliefs, so the difference is their cost.
     has_model = bool(jax.eval_shape(mapped(lambda *args: agent.begin_cycle(*args)[2]), *given))
-    model = mapped(lambda *args: agent.begin_cycle(*args)[0])
-    begin = mapped(lambda *args: agent.begin_cycle(*args)[:2])
-    update = mapped(lambda *args: agent.update(*args)[0])
+    model = mapped(lambda *args: at_precision(agent.begin_cycle)(*args)[0])
+    begin = mapped(lambda *args: at_precision(agent.begin_cycle)(*args)[:2])
+    update = mapped(lambda *args: at_precision(agent.update)(*args)[0])
     state, batches = begin(*given)
     batch = jax.tree.map(lambda leaf: leaf[:, 0], batches)
     updates = jax.tree.leaves(batches)[0].shape[1] / agent.cycle  # per environment step

@@ -32,6 +32,7 @@ from beliefrl.training import replay as ring
 from beliefrl.training import rollout
 from beliefrl.training.replay import Readers, Replay
 from beliefrl.training.rollout import ActorState, Episode
+from beliefrl.training.rounding import at_precision
 from beliefrl.types import Spec, UserError
 
 Metrics = dict[str, Float[Array, "..."]]
@@ -156,7 +157,7 @@ def pretrain(
     def update(seed: SeedState, number: Int[Array, ""]) -> tuple[SeedState, Metrics]:
         key_sample, key = jax.random.split(step_key(seed.key, number, PRETRAIN))
         windows, readers = ring.windows(seed.replay, seed.readers, key_sample, agent.pretrain_windows, agent.window)
-        state, metrics = agent.pretrain(seed.state, windows, key)
+        state, metrics = at_precision(agent.pretrain)(seed.state, windows, key)
         return seed._replace(state=state, readers=readers), metrics
 
     def step(i, carry):
@@ -241,14 +242,15 @@ def learn_cycle(agent: Agent, seed: SeedState, first: Int[Array, ""]) -> tuple[S
     """
     key = step_key(seed.key, first, SAMPLE)
     windows, readers = ring.windows(seed.replay, seed.readers, key, agent.cycle_windows, agent.window)
-    state, batches, model_metrics = agent.begin_cycle(seed.state, windows, step_key(seed.key, first, CYCLE))
+    begin_cycle = at_precision(agent.begin_cycle)
+    state, batches, model_metrics = begin_cycle(seed.state, windows, step_key(seed.key, first, CYCLE))
 
     count = len(jax.tree.leaves(batches)[0])
     begun = first * -(-count // agent.cycle)  # no two updates share a key
 
     def update(state, inputs):
         number, batch = inputs
-        return agent.update(state, batch, step_key(seed.key, begun + number, UPDATE))
+        return at_precision(agent.update)(state, batch, step_key(seed.key, begun + number, UPDATE))
 
     updates = jnp.arange(count)
     state, metrics = jax.lax.scan(update, state, (updates, batches))
