@@ -134,6 +134,16 @@ def large(_, *sides):
     return min(sides) >= N
 
 
+@pytest.mark.parametrize("name", PRODUCTS)
+def test_products_of_seeds_side_by_side_are_those_of_one_seed(name):
+    """Of the factors one or both differ between seeds."""
+    product, _ = PRODUCTS[name]
+    alone = [compiled(rounded(product))(A[i], B[i]) for i in range(3)]
+    np.testing.assert_allclose(compiled(jax.vmap(rounded(product)))(A, B), jnp.stack(alone), atol=1e-5)
+    alone = [compiled(rounded(product))(A[i], B[0]) for i in range(3)]
+    np.testing.assert_allclose(compiled(jax.vmap(rounded(product), (0, None)))(A, B[0]), jnp.stack(alone), atol=1e-5)
+
+
 @pytest.mark.parametrize("name", agents.names())
 @pytest.mark.parametrize("precision", ["float32", "tensorfloat32", "bfloat16"])
 def test_every_large_product_of_an_agents_learning_is_rounded_if_asked(name, precision):

@@ -13,9 +13,10 @@ from functools import partial
 from typing import Any
 
 import jax
+import jax.custom_batching
 import jax.extend
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, BFloat16, Float, Float32
 
 NAME = "bfloat16"  # of this precision, in JAX
 SMALLEST = 16  # products with a side shorter than this are not faster in bfloat16, and stay in float32
@@ -100,10 +101,24 @@ def _product(
     m, n, length = math.prod(rows), math.prod(columns), math.prod(a.shape[i] for i in sum_a)
     if min(m, n, length) < SMALLEST:
         return jax.lax.dot_general(a, b, dimension_numbers, **given)
-    left = _round(a, (*batch_a, *free_a, *sum_a)).reshape(*batch, m, length)
-    right = _round(b, (*batch_b, *sum_b, *free_b)).reshape(*batch, length, n)
-    product = jnp.matmul(left, right, precision=jax.lax.Precision.DEFAULT, preferred_element_type=jnp.float32)
+    left = _round(a, (*batch_a, *free_a, *sum_a)).reshape(-1, m, length)
+    right = _round(b, (*batch_b, *sum_b, *free_b)).reshape(-1, length, n)
+    product = jax.vmap(_matmul)(left, right) if batch else _matmul(left[0], right[0])
     return _hidden(product).reshape(*batch, *rows, *columns)
+
+
+@jax.custom_batching.custom_vmap
+def _matmul(a: BFloat16[Array, "m length"], b: BFloat16[Array, "length n"]) -> Float32[Array, "m n"]:
+    return jnp.matmul(a, b, precision=jax.lax.Precision.DEFAULT, preferred_element_type=jnp.float32)
+
+
+@_matmul.def_vmap
+def _one_by_one(size: int, mapped: Sequence[bool], a: Array, b: Array) -> tuple[Array, bool]:
+    """Products side by side, in a loop: XLA does not compute them at once (JAX 0.10, CPU)."""
+    both = [
+        x if is_mapped else jnp.broadcast_to(x, (size, *x.shape)) for x, is_mapped in zip((a, b), mapped, strict=True)
+    ]
+    return jax.lax.map(lambda pair: _matmul(*pair), tuple(both)), True
 
 
 def _others(axes: int, *taken: Sequence[int]) -> list[int]:
