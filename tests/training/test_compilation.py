@@ -256,7 +256,7 @@ def test_bench_all_prints_the_scalability_table(monkeypatch, capsys):
     """Every agent at the sizes asked for; measuring is left to the other tests."""
 
     def measured(agent, *sizes):
-        assert sizes == (4, 2, 3)
+        assert sizes == (4, 2, 3, "float32")
         return {"ms_per_step": 12.5, "parameters": parameters(shapes(agent, Spec(4, 2, 10))), "share_of_peak": 0.5}
 
     monkeypatch.setattr("beliefrl.training.bench.bench", measured)
