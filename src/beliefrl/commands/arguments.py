@@ -49,7 +49,10 @@ def _whole_number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[int] | No
 
 @VALUES.primitive_rule
 def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-    """Show T | None as T, and accept None as well."""
+    """Show T | None as T, and accept None as well.
+
+    Where a positional argument is left out beside an unknown option, tyro gives an empty list as its text.
+    """
     inner = [kind for kind in get_args(info.type) if kind is not NoneType]
     if info.type_origin not in (Union, UnionType) or len(inner) != 1:
         return None
@@ -58,7 +61,7 @@ def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
         return None
     return dataclasses.replace(
         spec,
-        instance_from_str=lambda given: None if given == ["None"] else spec.instance_from_str(given),
+        instance_from_str=lambda given: None if given in (["None"], [[]]) else spec.instance_from_str(given),
         is_instance=lambda value: value is None or spec.is_instance(value),
         str_from_instance=lambda value: ["None"] if value is None else spec.str_from_instance(value),
         choices=None if spec.choices is None else (*spec.choices, "None"),
@@ -205,6 +208,7 @@ WORDING = (  # message of tyro or Python: our message
     (r"Error parsing (\S+): could not convert string to float: (.*)", r"\1 must be a number, not \2"),
     (r"Error parsing (\S+): .* \[(.*)\]", r"\1 cannot be \2"),
     (r"invalid choice (.*) for argument '(\S+)'. Expected one of \((.*)\)", r"\2 must be one of \3, not \1"),
+    (r"Missing value for argument '([^-\s]\S*)'.*", r"\1 is missing"),  # a positional argument
     (r"Missing value for argument '(\S+)'.*", r"\1 needs a value"),
 )
 
