@@ -125,8 +125,8 @@ def bench(
         pretraining_ms; all of these per environment step. pretraining_ms_per_update; first_training_step_s (from the
         program's start to the end of the first cycle of learning, with exploration and pre-training shortened to one
         block); compile_s, its part for compilation; matmul_gflops; gflop_per_step, of the updates' matrix products that
-        are executed (`_flop`); share_of_peak, the rate of gflop_per_step in the loop divided by matmul_gflops;
-        parameters of one seed; obs, actions, seeds, precision, device.
+        are executed (`_flop`); share_of_peak, the rate of gflop_per_step in the loop divided by matmul_gflops, the rate
+        of float32; parameters of one seed; obs, actions, seeds, precision, device.
     """
     if not 1 <= seeds <= 2 * PAPER_STEPS:
         raise UserError(f"seeds={seeds} is impossible: it must be from 1 to {2 * PAPER_STEPS}.")

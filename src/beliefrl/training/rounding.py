@@ -1,10 +1,12 @@
 """Matrix products with factors rounded to bfloat16 and sums in float32: the precision `bfloat16` of the updates.
 
 The products of an update are rounded after JAX has differentiated it, so those of the gradients are rounded too, and an
-agent needs no code for it. A CPU with AVX-512 BF16 then computes large products up to twice as fast. Everything else
-stays in float32: the weights, the optimisers, sums, other functions, small products, and the actor.
+agent needs no code for it. A CPU with AVX-512 BF16 then computes large products up to twice as fast. On a CPU
+everything else stays in float32: the weights, the optimisers, sums, other functions, small products, and the actor.
 
-A traced function is run again, operation by operation, with other products. Loops and branches are traced again.
+A traced function is run again, operation by operation, with other products. Loops and branches get such programs
+inside. Products that ask for a precision of their own, and those in rarer operations that contain programs (a custom
+rule of vmap, a linear solver), are not rounded.
 """
 
 import math
@@ -20,7 +22,8 @@ from jaxtyping import Array, BFloat16, Float, Float32
 
 NAME = "bfloat16"  # of this precision, in JAX
 SMALLEST = 16  # products with a side shorter than this are not faster in bfloat16, and stay in float32
-CALLS = ("jit", "pjit", "closed_call", "checkpoint", "remat2", "custom_jvp_call", "custom_vjp_call")
+CALLS = ("jit", "pjit", "closed_call", "checkpoint", "remat2", "custom_jvp_call", "custom_vjp_call")  # run inline
+LOOPS = ("scan", "while", "cond")  # operations that contain programs
 
 
 def at_precision(update: Callable[..., Any]) -> Callable[..., Any]:
@@ -36,7 +39,8 @@ def rounded(function: Callable[..., Any]) -> Callable[..., Any]:
     """The function with the factors of its matrix products rounded to bfloat16."""
 
     def call(*args: Any) -> Any:
-        program, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
+        with jax.default_matmul_precision(NAME):  # so a product that asks for another one can be told apart
+            program, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
         return jax.tree.unflatten(jax.tree.structure(shapes), _run(program, *jax.tree.leaves(args)))
 
     return call
@@ -59,36 +63,33 @@ def _run(program: Any, *args: Any) -> list[Any]:
 def _apply(equation: Any, args: Sequence[Any]) -> Sequence[Any]:
     """The outputs of one operation; calls of an inner program are inlined."""
     name, given = equation.primitive.name, equation.params
-    if name == "dot_general" and all(arg.dtype == jnp.float32 for arg in args):
+    if name == "dot_general" and _is_plain(args, **given):
         return [_product(*args, **given)]
     if name in CALLS:
         inner = given.get("jaxpr", given.get("call_jaxpr"))
         closed = inner if hasattr(inner, "consts") else jax.extend.core.ClosedJaxpr(inner, ())
         return _run(closed, *args)
-    if name == "scan":
-        return _scan(args, **given)
-    if name == "while":
-        test, body = args[: given["cond_nconsts"]], args[given["cond_nconsts"] :][: given["body_nconsts"]]
-        start = args[given["cond_nconsts"] + given["body_nconsts"] :]
-        go_on, step = partial(_run, given["cond_jaxpr"], *test), partial(_run, given["body_jaxpr"], *body)
-        return jax.lax.while_loop(lambda state: go_on(*state)[0], lambda state: step(*state), list(start))
-    if name == "cond":
-        return jax.lax.switch(args[0], [partial(_run, branch) for branch in given["branches"]], *args[1:])
+    if name in LOOPS:
+        given = {key: _rounded_inside(inner) for key, inner in given.items()}
     outputs = equation.primitive.bind(*args, **given)
     return outputs if equation.primitive.multiple_results else [outputs]
 
 
-def _scan(
-    args: Sequence[Any], num_consts: int, num_carry: int, jaxpr: Any, length: int, reverse: bool, unroll: int, **_: Any
-) -> list[Any]:
-    consts, start, xs = args[:num_consts], args[num_consts:][:num_carry], args[num_consts + num_carry :]
+def _rounded_inside(given: Any) -> Any:
+    """A traced program, or the branches of a choice, with rounded products. Other parameters stay as they are."""
+    if isinstance(given, tuple):
+        return tuple(map(_rounded_inside, given))
+    if not isinstance(given, jax.extend.core.ClosedJaxpr):
+        return given
+    inputs = [jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=x.weak_type) for x in given.in_avals]
+    return jax.make_jaxpr(partial(_run, given))(*inputs)
 
-    def step(state: list[Any], x: list[Any]) -> tuple[list[Any], list[Any]]:
-        outputs = _run(jaxpr, *consts, *state, *x)
-        return outputs[:num_carry], outputs[num_carry:]
 
-    state, ys = jax.lax.scan(step, list(start), list(xs), length=length, reverse=reverse, unroll=unroll)
-    return [*state, *ys]
+def _is_plain(args: Sequence[Any], precision: Any, preferred_element_type: Any, **_: Any) -> bool:
+    """Whether a product is of float32 throughout, and asks for no precision of its own."""
+    usual = jax.lax.Precision.DEFAULT
+    types = {arg.dtype for arg in args} | {preferred_element_type or jnp.float32}
+    return precision in (None, usual, (usual, usual)) and all(jnp.dtype(each) == jnp.float32 for each in types)
 
 
 def _product(
@@ -99,7 +100,7 @@ def _product(
     free_a, free_b = (_others(x.ndim, *axes) for x, axes in ((a, (sum_a, batch_a)), (b, (sum_b, batch_b))))
     batch, rows, columns = ([x.shape[i] for i in axes] for x, axes in ((a, batch_a), (a, free_a), (b, free_b)))
     m, n, length = math.prod(rows), math.prod(columns), math.prod(a.shape[i] for i in sum_a)
-    if min(m, n, length) < SMALLEST:
+    if min(m, n, length) < SMALLEST or 0 in a.shape:
         return jax.lax.dot_general(a, b, dimension_numbers, **given)
     left = _round(a, (*batch_a, *free_a, *sum_a)).reshape(-1, m, length)
     right = _round(b, (*batch_b, *sum_b, *free_b)).reshape(-1, length, n)
@@ -135,7 +136,7 @@ def _round(x: Float[Array, "..."], axes: Sequence[int]) -> Float[Array, "..."]:
 def _hidden(x: Float[Array, "..."]) -> Float[Array, "..."]:
     """x, but XLA does not know it: the choice always takes x.
 
-    XLA makes a transposition a part of the product before or after it. It computes such a product in float32, or not at
-    all (JAX 0.10, CPU).
+    XLA makes a transposition a part of the product before or after it. It computes such a product in float32, or cannot
+    compile it (JAX 0.10, CPU).
     """
     return jnp.where(x[(0,) * x.ndim] > jnp.inf, 0.0, x)
