@@ -51,7 +51,7 @@ def _whole_number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[int] | No
 def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
     """Show T | None as T, and accept None as well.
 
-    Where a positional argument is left out beside an unknown option, tyro gives an empty list as its text.
+    If a positional argument is missing and there is an unknown option, tyro passes an empty list instead of a text.
     """
     inner = [kind for kind in get_args(info.type) if kind is not NoneType]
     if info.type_origin not in (Union, UnionType) or len(inner) != 1:

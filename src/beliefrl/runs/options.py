@@ -56,8 +56,8 @@ class Options:
     """Number of the latest checkpoints that are kept."""
     precision: Precision = "float32"
     """Precision of matrix products: float32, tensorfloat32 or bfloat16. With tensorfloat32, an NVIDIA GPU (Ampere or
-    later) may round the factors to 10 bits of mantissa, which is faster. A CPU ignores it. With bfloat16, the
-    factors of large products in the updates are rounded to 7 bits of mantissa, also on a CPU."""
+    later) may round the factors to 10 bits of mantissa, which is faster. A CPU ignores tensorfloat32. With
+    bfloat16, the factors of large products in the updates are rounded to 7 bits of mantissa, also on a CPU."""
     track: tuple[Literal["tensorboard", "wandb"], ...] = ("tensorboard",)
     """Trackers that receive the logged numbers, besides the run's own log: tensorboard, wandb, both, or none. wandb
     needs the extra `wandb`, and is offline unless WANDB_MODE is set."""

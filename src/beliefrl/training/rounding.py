@@ -2,11 +2,11 @@
 
 The products of an update are rounded after JAX has differentiated it, so those of the gradients are rounded too, and an
 agent needs no code for it. A CPU with AVX-512 BF16 then computes large products up to twice as fast. On a CPU
-everything else stays in float32: the weights, the optimisers, sums, other functions, small products, and the actor.
+everything else stays in float32: the weights, the optimisers, sums, other functions, small products, and acting.
 
-A traced function is run again, operation by operation, with other products. Loops and branches get such programs
-inside. Products that ask for a precision of their own, and those in rarer operations that contain programs (a custom
-rule of vmap, a linear solver), are not rounded.
+A traced function is run again, operation by operation, with other products. The programs inside loops and branches are
+replaced in the same way. Two kinds of products are not rounded: those that ask for another precision, and those inside
+rarer operations (a custom rule for vmap, a linear solver).
 """
 
 import math
@@ -39,7 +39,7 @@ def rounded(function: Callable[..., Any]) -> Callable[..., Any]:
     """The function with the factors of its matrix products rounded to bfloat16."""
 
     def call(*args: Any) -> Any:
-        with jax.default_matmul_precision(NAME):  # so a product that asks for another one can be told apart
+        with jax.default_matmul_precision(NAME):  # products with another precision asked for it themselves
             program, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
         return jax.tree.unflatten(jax.tree.structure(shapes), _run(program, *jax.tree.leaves(args)))
 
@@ -134,9 +134,9 @@ def _round(x: Float[Array, "..."], axes: Sequence[int]) -> Float[Array, "..."]:
 
 
 def _hidden(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """x, but XLA does not know it: the choice always takes x.
+    """x itself, as a choice whose outcome XLA does not know: it always takes x.
 
-    XLA makes a transposition a part of the product before or after it. It computes such a product in float32, or cannot
-    compile it (JAX 0.10, CPU).
+    Otherwise XLA joins a transposition with the product before or after it. Then it computes the product in float32, or
+    cannot compile it (JAX 0.10, CPU).
     """
     return jnp.where(x[(0,) * x.ndim] > jnp.inf, 0.0, x)
