@@ -242,10 +242,11 @@ def test_bench_prints_one_object_of_positive_numbers(monkeypatch):
     out = subprocess.run(command, capture_output=True, text=True, check=True, timeout=400).stdout
     result = json.loads(out)
     assert out.count("\n") == 1
-    assert set(result) == MEASURED | {"obs", "actions", "seeds", "device"}
+    assert set(result) == MEASURED | {"obs", "actions", "seeds", "device", "precision"}
     assert all(math.isfinite(result[key]) and result[key] > 0 for key in MEASURED)
     assert (result["obs"], result["actions"], result["seeds"]) == (2, 1, 2)
     assert result["device"] == jax.devices()[0].device_kind
+    assert result["precision"] == "float32"
     agent = agents.make(
         "vrm", d_size=4, z_size=2, hidden_size=4, policy_layers=(4,), value_layers=(4,), seq_len=4, burn_in=2
     )
