@@ -222,6 +222,46 @@ def test_beliefs_of_means_are_without_noise_where_it_acts_and_where_it_learns(st
     assert differ(*(act(state, memory, step, jax.random.key(k), jnp.array(True))[0] for k in (1, 2)))  # still samples
 
 
+def test_a_burn_in_from_stored_states_continues_them(state):
+    """With states that the model itself made, beliefs are those of the whole episode."""
+    agent = dataclasses.replace(AGENT, store_state=True, sample_belief=False)
+    whole, begin = windows(jax.random.key(1), 12), 2
+    states = jax.jit(agent.unroll)(state.keep, whole, agent.noise(jax.random.key(0), whole, False))
+    window = whole._replace(note=(*whole.note, *states)).between(begin, None)
+    short = dataclasses.replace(agent, burn_in=agent.burn_in - begin)
+    from_zero = dataclasses.replace(short, store_state=False)
+    kept = slice(agent.d_size, 2 * agent.d_size)
+    stored, zero, true = (
+        jax.jit(each.batches)(state, given, jax.random.key(2)).belief[..., kept]
+        for each, given in (
+            (short, window),
+            (from_zero, window),
+            (dataclasses.replace(agent, store_state=False), whole),
+        )
+    )
+    np.testing.assert_allclose(stored, true, rtol=1e-5, atol=1e-6)
+    assert differ(zero, true)
+
+    changed = window._replace(note=(*window.note[:1], *(leaf + 1 for leaf in window.note[1:])))
+    losses = [
+        jax.jit(short.begin_cycle)(state, each, jax.random.key(2))[2]["negative_elbo"] for each in (window, changed)
+    ]
+    assert differ(*losses)  # the model learns from them as well
+
+
+def test_stored_states_are_those_after_acting(state):
+    agent = dataclasses.replace(AGENT, store_state=True)
+    step = jax.tree.map(lambda leaf: leaf[0, 0], windows(jax.random.key(1), 1).step)
+    _, memory = jax.jit(agent.act)(state, agent.reset(SPEC), step, jax.random.key(2), jnp.array(True))
+    assert same(agent.note(memory), (memory.first.d, memory.keep.d, memory.keep.c))
+
+
+@pytest.mark.parametrize("options", [{"burn_in": 0}, {"models": "first"}])
+def test_stored_states_need_a_burn_in_and_a_keep_learning_model(options):
+    with pytest.raises(UserError, match="store_state=True is impossible"):
+        VRMAgent(store_state=True, **options)
+
+
 @pytest.mark.nightly
 def test_standardised_beliefs_are_what_the_controller_learns_from_and_acts_on(state):
     agent, window = dataclasses.replace(AGENT, standardise=True), windows(jax.random.key(1), 12)

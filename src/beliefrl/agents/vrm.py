@@ -88,6 +88,9 @@ class VRMAgent(SACAgent):
     """Distribution of z when x is decoded in training: posterior (a true ELBO) or prior (the authors' code)."""
     store_first_impression: bool = True
     """Store the first-impression model's d in the replay, and do not compute it again for every update."""
+    store_state: bool = False
+    """Store the keep-learning model's state in the replay. A burn-in then starts from it and not from zero, so that a
+    shorter `burn_in`, which takes less time, is enough."""
     sample_belief: bool = True
     """Form beliefs with a sample of z, as in the training of the models; if False, with the posterior's mean."""
     standardise: bool = False
@@ -110,6 +113,11 @@ class VRMAgent(SACAgent):
         check_choice(self, "models", ("both", "single", "first", "keep"))
         check_choice(self, "elbo_scaling", ("mean", "sum"))
         check_choice(self, "decode_from", ("posterior", "prior"))
+        if self.store_state and (not self.burn_in or not self.has_keep):
+            raise UserError(
+                "store_state=True is impossible without a burn-in and a keep-learning model: "
+                "set burn_in to at least 1, and models to another value than 'first'."
+            )
         if self.train_interval_klvrm % self.train_interval_rl:
             raise UserError(
                 f"train_interval_klvrm={self.train_interval_klvrm} is not a multiple of "
@@ -203,8 +211,9 @@ class VRMAgent(SACAgent):
         return self.choose(state.controller, standardise(state.scale, belief), key_action, explore), memory
 
     def note(self, memory: Memory) -> tuple[Float[Array, " d"], ...]:
-        """d_t of the first-impression model, or nothing."""
-        return (memory.first.d,) if self.store_first_impression and memory.first is not None else ()
+        """d_t of the first-impression model, then the state of the keep-learning model, if they are stored."""
+        first = (memory.first.d,) if self.store_first_impression and memory.first is not None else ()
+        return (*first, *memory.keep) if self.store_state and memory.keep is not None else first
 
     # Predicting (Appendix "Model Accuracy")
 
@@ -227,28 +236,33 @@ class VRMAgent(SACAgent):
         first, optimiser, metrics = self.learn_model(state.first, state.first_optimiser, windows, key)
         return state._replace(first=first, first_optimiser=optimiser), metrics
 
-    def learn_keep(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Metrics]:
-        """One update of the keep-learning model, if there is one."""
+    def learn_keep(
+        self, state: State, windows: Window, key: Key[Array, ""], first: LSTMState | None = None
+    ) -> tuple[State, Metrics]:
+        """One update of the keep-learning model, if there is one; `first` as in `unroll`."""
         if state.keep is None:
             return state, {}
-        keep, optimiser, metrics = self.learn_model(state.keep, state.keep_optimiser, windows, key)
+        keep, optimiser, metrics = self.learn_model(state.keep, state.keep_optimiser, windows, key, first)
         return state._replace(keep=keep, keep_optimiser=optimiser), metrics
 
     def learn_model(
-        self, vrm: VRM, optimiser: optax.OptState, windows: Window, key: Key[Array, ""]
+        self, vrm: VRM, optimiser: optax.OptState, windows: Window, key: Key[Array, ""], first: LSTMState | None = None
     ) -> tuple[VRM, optax.OptState, Metrics]:
         """One Adam step on the negative ELBO of `seq_len` timesteps after the burn-in."""
-        grads, metrics = jax.grad(self.model_loss, has_aux=True)(vrm, windows, key)
+        grads, metrics = jax.grad(self.model_loss, has_aux=True)(vrm, windows, key, first)
         return *descend(self.model_optimiser, grads, optimiser, vrm), metrics
 
-    def model_loss(self, vrm: VRM, windows: Window, key: Key[Array, ""]) -> tuple[Float[Array, ""], Metrics]:
+    def model_loss(
+        self, vrm: VRM, windows: Window, key: Key[Array, ""], first: LSTMState | None = None
+    ) -> tuple[Float[Array, ""], Metrics]:
         """The negative ELBO (squared error of deterministic models), mean over the valid timesteps after burn-in."""
         key_burn_in, key_infer, key_prior = jax.random.split(key, 3)
         before, after = windows.between(0, self.burn_in), windows.between(self.burn_in, -1)
         start = vrm.start(self.batch_size)
         if self.burn_in:
             noise = self.noise(key_burn_in, before)
-            start = jax.tree.map(lambda leaf: leaf[-1], self.unroll(jax.lax.stop_gradient(vrm), before, noise))
+            states = self.unroll(jax.lax.stop_gradient(vrm), before, noise, first)
+            start = jax.tree.map(lambda leaf: leaf[-1], states)
         inputs = (perception(after.step), after.step.prev_action)
         inferred = vrm.infer(start, *inputs, after.step.is_first, self.noise(key_infer, after))
 
@@ -262,10 +276,23 @@ class VRMAgent(SACAgent):
         kl, log_likelihood = map(mean, elbo_terms(vrm, inferred, *inputs, self.elbo_scaling, prior_noise))
         return kl - log_likelihood, {"kl": kl, "log_likelihood": log_likelihood, "negative_elbo": kl - log_likelihood}
 
-    def unroll(self, vrm: VRM, windows: Window, noise: Float[Array, "time batch z"]) -> LSTMState:
-        """A model's states along windows (time-major), from the empty state; leaves (time, batch, d)."""
-        step, start = windows.step, vrm.start(windows.exists.shape[1])
-        return vrm.infer(start, perception(step), step.prev_action, step.is_first, noise).state
+    def unroll(
+        self, vrm: VRM, windows: Window, noise: Float[Array, "time batch z"], first: LSTMState | None = None
+    ) -> LSTMState:
+        """A model's states along windows (time-major), leaves (time, batch, d).
+
+        `first` are the states of the first timestep, leaves (batch, d); None: the windows start from the empty state.
+        """
+        step = windows.step
+        inputs = perception(step), step.prev_action, step.is_first, noise
+        if first is None:
+            return vrm.infer(vrm.start(windows.exists.shape[1]), *inputs).state
+        later = vrm.infer(first, *(leaf[1:] for leaf in inputs)).state
+        return jax.tree.map(lambda known, rest: jnp.concatenate([known[None], rest]), first, later)
+
+    def stored_state(self, windows: Window) -> LSTMState | None:
+        """The keep-learning model's states of the first timestep of windows, leaves (batch, d), if they are stored."""
+        return LSTMState(*(leaf[0] for leaf in windows.note[-2:])) if self.store_state else None
 
     def noise(self, key: Key[Array, ""], windows: Window, sampled: bool = True) -> Float[Array, "time batch z"]:
         shape = *windows.exists.shape, self.z_size
@@ -278,7 +305,7 @@ class VRMAgent(SACAgent):
         count = self.batch_size * self.has_keep
         for_model = jax.tree.map(lambda leaf: leaf[:, :count], windows)
         for_controller = jax.tree.map(lambda leaf: leaf[:, count:], windows)
-        state, metrics = self.learn_keep(state, for_model, key_model)
+        state, metrics = self.learn_keep(state, for_model, key_model, self.stored_state(for_model))
         scale, batches = standardise_beliefs(state.scale, self.batches(state, for_controller, key_belief))
         return state._replace(scale=scale), batches, metrics
 
@@ -287,7 +314,7 @@ class VRMAgent(SACAgent):
         of_first, of_keep = (self.noise(k, windows, self.sample_belief) for k in jax.random.split(key))
         parts = [perception(windows.step)]
         if state.keep is not None:
-            parts.insert(0, self.unroll(state.keep, windows, of_keep).d)
+            parts.insert(0, self.unroll(state.keep, windows, of_keep, self.stored_state(windows)).d)
         if state.first is not None:
             stored = self.store_first_impression
             parts.insert(0, windows.note[0] if stored else self.unroll(state.first, windows, of_first).d)
