@@ -4,6 +4,7 @@
     python benchmarks/throughput.py envs               # a slow Gymnasium environment, by the number of environments
     python benchmarks/throughput.py cores [AGENT ...]  # one program on all cores, and one per core
     python benchmarks/throughput.py precision [AGENT ...]  # products in float32 and in bfloat16
+    python benchmarks/throughput.py burn-in            # vrm with shorter burn-ins
 
 `--help` after one of these words describes what is measured, and its options.
 """
@@ -186,7 +187,32 @@ def cores(names: tyro.conf.Positional[tuple[str, ...]] = NAMES) -> None:
         print(f"{agent}: {statistics.median(ratios):.2f} times the throughput of one (median of {REPEATED})")
 
 
-# precision
+# precision, burn-in
+
+
+def times_in_turn(trainings, rounds: int, seeds: int = 1) -> list[list[float]]:
+    """Milliseconds per step (round, training) of trainings (agent, precision) that make their steps in turn."""
+    keys = jax.random.split(jax.random.key(0), seeds)
+    programs = {agent: phases.compile_program(agent, Noise(6, 3), 125_000, 1) for agent, _ in trainings}
+    states, times = [], []
+    for agent, _ in trainings:
+        program, stretch = programs[agent], phases.stretch_length(agent)
+        states.append(program.explore(program.begin(keys), 0, stretch)[0])
+    for number in range(rounds + 1):
+        times.append([])
+        for index, (agent, kind) in enumerate(trainings):
+            stretch = phases.stretch_length(agent)
+            with jax.default_matmul_precision(kind):
+                before, first = time.perf_counter(), stretch * (number + 1)
+                learned, _ = programs[agent].learn(states[index], first, stretch // agent.cycle)
+                states[index] = jax.block_until_ready(learned)
+            times[-1].append(1e3 * (time.perf_counter() - before) / stretch)
+    return times[1:]  # the first round compiles
+
+
+def ratio(times: list[list[float]], index: int) -> float:
+    """The median of the time of one training divided by that of the first one in the same round."""
+    return statistics.median(each[index] / each[0] for each in times)
 
 
 def precision(names: tyro.conf.Positional[tuple[str, ...]] = NAMES, seeds: int = 1, rounds: int = 9) -> None:
@@ -200,27 +226,39 @@ def precision(names: tyro.conf.Positional[tuple[str, ...]] = NAMES, seeds: int =
         seeds: seeds that train at the same time.
         rounds: how often both are timed.
     """
-    keys = jax.random.split(jax.random.key(0), seeds)
     print(f"{'agent':<16}{'float32':>10}{'bfloat16':>10}{'ratio':>8}   ms/step; {seeds} seeds")
     for name in names:
-        agent, times = agents.make(name), []
-        stretch = phases.stretch_length(agent)
-        program = phases.compile_program(agent, Noise(6, 3), 125_000, 1)
-        states = [program.explore(program.begin(keys), 0, stretch)[0] for _ in range(2)]
-        for number in range(rounds + 1):
-            both = []
-            for index, kind in enumerate(("float32", "bfloat16")):
-                with jax.default_matmul_precision(kind):
-                    before, first = time.perf_counter(), stretch * (number + 1)
-                    states[index] = jax.block_until_ready(
-                        program.learn(states[index], first, stretch // agent.cycle)[0]
-                    )
-                both.append(1e3 * (time.perf_counter() - before) / stretch)
-            times.append(both)
-        single, rounded = (statistics.median(each) for each in zip(*times[1:], strict=True))  # the first compiles
-        ratio = statistics.median(b / a for a, b in times[1:])
-        print(f"{name:<16}{single:>10.2f}{rounded:>10.2f}{ratio:>8.3f}", flush=True)
+        agent = agents.make(name)
+        times = times_in_turn([(agent, "float32"), (agent, "bfloat16")], rounds, seeds)
+        single, rounded = (statistics.median(each) for each in zip(*times, strict=True))
+        print(f"{name:<16}{single:>10.2f}{rounded:>10.2f}{ratio(times, 1):>8.3f}", flush=True)
+
+
+def burn_in(rounds: int = 9) -> None:
+    """Compare the time of a training step of `vrm` with shorter burn-ins to that with the default settings.
+
+    All train in turn, at the sizes of velocities-only Hopper. Prints medians in milliseconds per step, and the median
+    ratio of two times of the same round.
+
+    Args:
+        rounds: how often each is timed.
+    """
+    default, short = agents.make("vrm"), agents.make("vrm", burn_in=16)
+    stored = agents.make("vrm", burn_in=16, store_state=True)
+    trainings = {
+        "the defaults": (default, "float32"),
+        "--burn-in 16": (short, "float32"),
+        "--burn-in 16 --store-state": (stored, "float32"),
+        "--burn-in 16 --store-state --precision bfloat16": (stored, "bfloat16"),
+    }
+    times = times_in_turn(list(trainings.values()), rounds)
+    print(f"{'vrm':<50}{'ms/step':>8}{'ratio':>8}")
+    for index, name in enumerate(trainings):
+        median = statistics.median(each[index] for each in times)
+        print(f"{name:<50}{median:>8.2f}{ratio(times, index):>8.3f}", flush=True)
 
 
 if __name__ == "__main__":
-    tyro.extras.subcommand_cli_from_dict({"host-loop": host_loop, "envs": envs, "cores": cores, "precision": precision})
+    tyro.extras.subcommand_cli_from_dict(
+        {"host-loop": host_loop, "envs": envs, "cores": cores, "precision": precision, "burn-in": burn_in}
+    )
