@@ -15,6 +15,7 @@ import tyro
 from beliefrl import cli
 from beliefrl.commands import COMMANDS
 from beliefrl.commands.arguments import UsageError, parse
+from beliefrl.commands.pictures import DemoOptions, FilmOptions, PredictOptions
 from beliefrl.runs.run import Run
 from beliefrl.sweeps.plan import grid, plan
 from beliefrl.sweeps.run import sweep
@@ -45,6 +46,11 @@ def printed(capsys, line):
     out, err = capsys.readouterr()
     assert err == ""
     return out
+
+
+@pytest.mark.parametrize(("options", "given"), [(PredictOptions, ["run"]), (FilmOptions, ["run"]), (DemoOptions, [])])
+def test_the_file_of_a_picture_can_be_given_by_a_short_option(options, given):
+    assert str(parse(options, [*given, "-o", "file.png"], "beliefrl").out) == "file.png"
 
 
 def test_help_names_every_command(capsys):

@@ -22,7 +22,7 @@ class PredictOptions:
 
     run: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
-    out: pathlib.Path | None = None
+    out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """The picture to write, as PNG and as PDF. None: predictions.png in the run's folder."""
     model: str | None = None
     """The model to use: keep or first for vrm, latent for slac. None: the first of these that the agent has."""
@@ -76,7 +76,7 @@ class FilmOptions:
         tyro.conf.Positional[tuple[pathlib.Path, ...]], tyro.conf.arg(metavar="RUN", help_behavior_hint="(required)")
     ]
     """The folders of the runs."""
-    out: pathlib.Path | None = None
+    out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """The strip to write, as PNG and as PDF. None: film.png in the first run's folder."""
     frames: int = 8
     """Number of frames in a row."""
@@ -100,7 +100,7 @@ class DemoOptions:
 
     task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="[TASK]")] = "pendulum-v"
     """cartpole-v, pendulum-v or target-reaching."""
-    out: Annotated[pathlib.Path | None, tyro.conf.arg(metavar="FILE")] = None
+    out: Annotated[pathlib.Path | None, tyro.conf.arg(metavar="FILE", aliases=["-o"])] = None
     """The video to write, .gif or .mp4. An existing file is replaced. None: a window if there is a display and pygame
     (extra `render`), otherwise beliefrl-demo-TASK.gif."""
     episode_seed: int = 4
