@@ -66,7 +66,8 @@ class VRMAgent(SACAgent):
 
     # Appendix A.1
     burn_in: int = 64
-    """Burn-in: at most this many steps before a sequence initialise its state, from zero (Appendix A.1.2)."""
+    """Burn-in: at most this many steps before a sequence initialise its state (Appendix A.1.2). It starts from zero, or
+    with store_state from the stored state."""
     d_size: int = 256
     """Size of the recurrent state d of each model (Appendix A.1.1)."""
     z_size: int = 64
@@ -89,8 +90,8 @@ class VRMAgent(SACAgent):
     store_first_impression: bool = True
     """Store the first-impression model's d in the replay, and do not compute it again for every update."""
     store_state: bool = False
-    """Store the keep-learning model's state in the replay. A burn-in then starts from it and not from zero, so that a
-    shorter `burn_in`, which takes less time, is enough."""
+    """Store the keep-learning model's state in the replay. After the pre-training its burn-ins then start from it, and
+    not from zero. It is meant for a shorter `burn_in`, which takes less time."""
     sample_belief: bool = True
     """Form beliefs with a sample of z, as in the training of the models; if False, with the posterior's mean."""
     standardise: bool = False
@@ -237,31 +238,34 @@ class VRMAgent(SACAgent):
         return state._replace(first=first, first_optimiser=optimiser), metrics
 
     def learn_keep(
-        self, state: State, windows: Window, key: Key[Array, ""], first: LSTMState | None = None
+        self, state: State, windows: Window, key: Key[Array, ""], known: LSTMState | None = None
     ) -> tuple[State, Metrics]:
-        """One update of the keep-learning model, if there is one; `first` as in `unroll`."""
+        """One update of the keep-learning model, if there is one; `known` as in `unroll`."""
         if state.keep is None:
             return state, {}
-        keep, optimiser, metrics = self.learn_model(state.keep, state.keep_optimiser, windows, key, first)
+        keep, optimiser, metrics = self.learn_model(state.keep, state.keep_optimiser, windows, key, known)
         return state._replace(keep=keep, keep_optimiser=optimiser), metrics
 
     def learn_model(
-        self, vrm: VRM, optimiser: optax.OptState, windows: Window, key: Key[Array, ""], first: LSTMState | None = None
+        self, vrm: VRM, optimiser: optax.OptState, windows: Window, key: Key[Array, ""], known: LSTMState | None = None
     ) -> tuple[VRM, optax.OptState, Metrics]:
         """One Adam step on the negative ELBO of `seq_len` timesteps after the burn-in."""
-        grads, metrics = jax.grad(self.model_loss, has_aux=True)(vrm, windows, key, first)
+        grads, metrics = jax.grad(self.model_loss, has_aux=True)(vrm, windows, key, known)
         return *descend(self.model_optimiser, grads, optimiser, vrm), metrics
 
     def model_loss(
-        self, vrm: VRM, windows: Window, key: Key[Array, ""], first: LSTMState | None = None
+        self, vrm: VRM, windows: Window, key: Key[Array, ""], known: LSTMState | None = None
     ) -> tuple[Float[Array, ""], Metrics]:
-        """The negative ELBO (squared error of deterministic models), mean over the valid timesteps after burn-in."""
+        """The negative ELBO (squared error of deterministic models), mean over the valid timesteps after burn-in.
+
+        `known` as in `unroll`; without it the burn-in starts from the empty state.
+        """
         key_burn_in, key_infer, key_prior = jax.random.split(key, 3)
         before, after = windows.between(0, self.burn_in), windows.between(self.burn_in, -1)
         start = vrm.start(self.batch_size)
         if self.burn_in:
             noise = self.noise(key_burn_in, before)
-            states = self.unroll(jax.lax.stop_gradient(vrm), before, noise, first)
+            states = self.unroll(jax.lax.stop_gradient(vrm), before, noise, known)
             start = jax.tree.map(lambda leaf: leaf[-1], states)
         inputs = (perception(after.step), after.step.prev_action)
         inferred = vrm.infer(start, *inputs, after.step.is_first, self.noise(key_infer, after))
@@ -277,18 +281,18 @@ class VRMAgent(SACAgent):
         return kl - log_likelihood, {"kl": kl, "log_likelihood": log_likelihood, "negative_elbo": kl - log_likelihood}
 
     def unroll(
-        self, vrm: VRM, windows: Window, noise: Float[Array, "time batch z"], first: LSTMState | None = None
+        self, vrm: VRM, windows: Window, noise: Float[Array, "time batch z"], known: LSTMState | None = None
     ) -> LSTMState:
         """A model's states along windows (time-major), leaves (time, batch, d).
 
-        `first` are the states of the first timestep, leaves (batch, d); None: the windows start from the empty state.
+        `known` are the states of the first timestep, leaves (batch, d); None: the windows start from the empty state.
         """
         step = windows.step
         inputs = perception(step), step.prev_action, step.is_first, noise
-        if first is None:
+        if known is None:
             return vrm.infer(vrm.start(windows.exists.shape[1]), *inputs).state
-        later = vrm.infer(first, *(leaf[1:] for leaf in inputs)).state
-        return jax.tree.map(lambda known, rest: jnp.concatenate([known[None], rest]), first, later)
+        later = vrm.infer(known, *(leaf[1:] for leaf in inputs)).state
+        return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), known, later)
 
     def stored_state(self, windows: Window) -> LSTMState | None:
         """The keep-learning model's states of the first timestep of windows, leaves (batch, d), if they are stored."""
