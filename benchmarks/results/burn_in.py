@@ -13,6 +13,7 @@ import sys
 import jax
 import numpy as np
 
+from beliefrl.models.window_loss import states
 from beliefrl.training.evaluation import restore_seed
 from beliefrl.types import Window
 from beliefrl.viewing.episodes import Player
@@ -28,7 +29,7 @@ def differences(agent, vrm, episodes):
     @jax.jit
     def unroll(steps):
         exists = np.ones(steps.reward.shape, bool)
-        return agent.unroll(vrm, Window(steps, (), exists), np.zeros((*exists.shape, agent.z_size), np.float32)).d
+        return states(vrm, Window(steps, (), exists), np.zeros((*exists.shape, agent.z_size), np.float32)).d
 
     length, starts, true = max(TIMESTEPS), [], []
     for steps in episodes:

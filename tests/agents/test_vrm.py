@@ -12,6 +12,7 @@ from beliefrl import agents
 from beliefrl.agents.vrm import VRMAgent
 from beliefrl.models.nets import initial_statistics, standardise
 from beliefrl.models.variational_model import VRM
+from beliefrl.models.window_loss import draw_noise, model_loss, states
 from beliefrl.types import Timestep, UserError, Window, check_choice, perception
 from inputs import SMALL, SPEC, differ, same
 
@@ -201,7 +202,7 @@ def test_a_recomputed_first_impression_is_the_stored_one_up_to_its_sample(state)
     recompute = dataclasses.replace(AGENT, store_first_impression=False)
     window = windows(jax.random.key(1), 10)
     key_first, _ = jax.random.split(jax.random.key(2))
-    d_first = jax.jit(AGENT.unroll)(state.first, window, AGENT.noise(key_first, window)).d
+    d_first = jax.jit(states)(state.first, window, draw_noise(key_first, window, AGENT.z_size)).d
     stored = jax.jit(AGENT.batches)(state, window._replace(note=(d_first,)), jax.random.key(2))
     again = jax.jit(recompute.batches)(state, window._replace(note=()), jax.random.key(2))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), stored, again)
@@ -226,8 +227,8 @@ def test_a_burn_in_from_stored_states_continues_them(state):
     """With states that the model itself made, beliefs are those of the whole episode."""
     agent = dataclasses.replace(AGENT, store_state=True, sample_belief=False)
     whole, begin = windows(jax.random.key(1), 12), 2
-    states = jax.jit(agent.unroll)(state.keep, whole, agent.noise(jax.random.key(0), whole, False))
-    window = whole._replace(note=(*whole.note, *states)).between(begin, None)
+    made = jax.jit(states)(state.keep, whole, agent.belief_noise(jax.random.key(0), whole))
+    window = whole._replace(note=(*whole.note, *made)).between(begin, None)
     short = dataclasses.replace(agent, burn_in=agent.burn_in - begin)
     from_zero = dataclasses.replace(short, store_state=False)
     kept = slice(agent.d_size, 2 * agent.d_size)
@@ -282,9 +283,11 @@ def test_standardised_beliefs_are_what_the_controller_learns_from_and_acts_on(st
 def test_decoding_from_the_prior_and_sums_are_other_losses(state):
     window = windows(jax.random.key(1), 2)
     loss = {
-        options: jax.jit(dataclasses.replace(AGENT, decode_from=options[0], elbo_scaling=options[1]).model_loss)(
-            state.keep, window, jax.random.key(2)
-        )[1]
+        options: jax.jit(
+            lambda options=options: model_loss(
+                state.keep, window, jax.random.key(2), AGENT.burn_in, decode_from=options[0], scaling=options[1]
+            )
+        )()[1]
         for options in (("posterior", "mean"), ("prior", "mean"), ("posterior", "sum"))
     }
     mean, prior, total = loss.values()

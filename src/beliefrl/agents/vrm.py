@@ -24,8 +24,9 @@ from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents.base import Metrics, Range, SACAgent, split_updates, standardise_beliefs
 from beliefrl.models.nets import Gaussian, LSTMState, RunningStatistics, descend, draw, initial_statistics, standardise
-from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean
-from beliefrl.models.variational_model import VRM, elbo_terms, predict, prediction_error
+from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState
+from beliefrl.models.variational_model import VRM, predict
+from beliefrl.models.window_loss import draw_noise, model_loss, states
 from beliefrl.types import WIDEST, Spec, Timestep, UserError, Window, WindowShape, check_choice, check_range, perception
 
 
@@ -240,7 +241,7 @@ class VRMAgent(SACAgent):
     def learn_keep(
         self, state: State, windows: Window, key: Key[Array, ""], known: LSTMState | None = None
     ) -> tuple[State, Metrics]:
-        """One update of the keep-learning model, if there is one; `known` as in `unroll`."""
+        """One update of the keep-learning model, if there is one; `known` as in `learn_model`."""
         if state.keep is None:
             return state, {}
         keep, optimiser, metrics = self.learn_model(state.keep, state.keep_optimiser, windows, key, known)
@@ -249,58 +250,14 @@ class VRMAgent(SACAgent):
     def learn_model(
         self, vrm: VRM, optimiser: optax.OptState, windows: Window, key: Key[Array, ""], known: LSTMState | None = None
     ) -> tuple[VRM, optax.OptState, Metrics]:
-        """One Adam step on the negative ELBO of `seq_len` timesteps after the burn-in."""
-        grads, metrics = jax.grad(self.model_loss, has_aux=True)(vrm, windows, key, known)
+        """One Adam step on the loss of `seq_len` timesteps after the burn-in; `known` as in `window_loss.states`."""
+        options = self.burn_in, known, self.elbo_scaling, self.decode_from
+        grads, metrics = jax.grad(model_loss, has_aux=True)(vrm, windows, key, *options)
         return *descend(self.model_optimiser, grads, optimiser, vrm), metrics
-
-    def model_loss(
-        self, vrm: VRM, windows: Window, key: Key[Array, ""], known: LSTMState | None = None
-    ) -> tuple[Float[Array, ""], Metrics]:
-        """The negative ELBO (squared error of deterministic models), mean over the valid timesteps after burn-in.
-
-        `known` as in `unroll`; without it the burn-in starts from the empty state.
-        """
-        key_burn_in, key_infer, key_prior = jax.random.split(key, 3)
-        before, after = windows.between(0, self.burn_in), windows.between(self.burn_in, -1)
-        start = vrm.start(self.batch_size)
-        if self.burn_in:
-            noise = self.noise(key_burn_in, before)
-            states = self.unroll(jax.lax.stop_gradient(vrm), before, noise, known)
-            start = jax.tree.map(lambda leaf: leaf[-1], states)
-        inputs = (perception(after.step), after.step.prev_action)
-        inferred = vrm.infer(start, *inputs, after.step.is_first, self.noise(key_infer, after))
-
-        def mean(term: Float[Array, "time batch"]) -> Float[Array, ""]:
-            return valid_mean(term.ravel(), after.exists.ravel())
-
-        if self.deterministic:
-            error = mean(prediction_error(vrm, inferred, inputs[0]))
-            return error, {"prediction_error": error}
-        prior_noise = self.noise(key_prior, after) if self.decode_from == "prior" else None
-        kl, log_likelihood = map(mean, elbo_terms(vrm, inferred, *inputs, self.elbo_scaling, prior_noise))
-        return kl - log_likelihood, {"kl": kl, "log_likelihood": log_likelihood, "negative_elbo": kl - log_likelihood}
-
-    def unroll(
-        self, vrm: VRM, windows: Window, noise: Float[Array, "time batch z"], known: LSTMState | None = None
-    ) -> LSTMState:
-        """A model's states along windows (time-major), leaves (time, batch, d).
-
-        `known` are the states of the first timestep, leaves (batch, d); None: the windows start from the empty state.
-        """
-        step = windows.step
-        inputs = perception(step), step.prev_action, step.is_first, noise
-        if known is None:
-            return vrm.infer(vrm.start(windows.exists.shape[1]), *inputs).state
-        later = vrm.infer(known, *(leaf[1:] for leaf in inputs)).state
-        return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), known, later)
 
     def stored_state(self, windows: Window) -> LSTMState | None:
         """The keep-learning model's states of the first timestep of windows, leaves (batch, d), if they are stored."""
         return LSTMState(*(leaf[0] for leaf in windows.note[-2:])) if self.store_state else None
-
-    def noise(self, key: Key[Array, ""], windows: Window, sampled: bool = True) -> Float[Array, "time batch z"]:
-        shape = *windows.exists.shape, self.z_size
-        return jax.random.normal(key, shape) if sampled else jnp.zeros(shape)
 
     # Learning the controller (Figure 2a)
 
@@ -313,15 +270,20 @@ class VRMAgent(SACAgent):
         scale, batches = standardise_beliefs(state.scale, self.batches(state, for_controller, key_belief))
         return state._replace(scale=scale), batches, metrics
 
+    def belief_noise(self, key: Key[Array, ""], windows: Window) -> Float[Array, "time batch z"]:
+        """The noise of z in beliefs; zeros if they are formed with the posterior's mean."""
+        noise = draw_noise(key, windows, self.z_size)
+        return noise if self.sample_belief else jnp.zeros_like(noise)
+
     def batches(self, state: State, windows: Window, key: Key[Array, ""]) -> Batch:
         """The windows' transitions with their beliefs, split for a cycle's updates: leaves (update, batch, ...)."""
-        of_first, of_keep = (self.noise(k, windows, self.sample_belief) for k in jax.random.split(key))
+        of_first, of_keep = (self.belief_noise(k, windows) for k in jax.random.split(key))
         parts = [perception(windows.step)]
         if state.keep is not None:
-            parts.insert(0, self.unroll(state.keep, windows, of_keep, self.stored_state(windows)).d)
+            parts.insert(0, states(state.keep, windows, of_keep, self.stored_state(windows)).d)
         if state.first is not None:
             stored = self.store_first_impression
-            parts.insert(0, windows.note[0] if stored else self.unroll(state.first, windows, of_first).d)
+            parts.insert(0, windows.note[0] if stored else states(state.first, windows, of_first).d)
         belief = jnp.concatenate(parts, axis=-1)[self.burn_in :]
         return split_updates(self.transitions(windows, belief), self.batch_size)
 

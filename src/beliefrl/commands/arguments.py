@@ -5,6 +5,7 @@ import dataclasses
 import difflib
 import io
 import json
+import pathlib
 import re
 from collections.abc import Sequence
 from decimal import Decimal, InvalidOperation
@@ -111,6 +112,7 @@ OwnAgent = Annotated[
         help="The class of the agent, where an agent of your own was trained. Its module is imported.",
     ),
 ]
+Out = Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])]
 Best = Annotated[
     bool,
     tyro.conf.arg(

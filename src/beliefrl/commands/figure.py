@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from beliefrl.commands.arguments import UsageError, parse
+from beliefrl.commands.arguments import Out, UsageError, parse
 
 KINDS = ("curves", "run", "ablation", "sensitivity", "elbo", "aggregate", "scalability", "table")
 TABLES = ("scalability", "table")
@@ -36,7 +36,7 @@ class FigureOptions:
         tyro.conf.Positional[tuple[pathlib.Path, ...]], tyro.conf.arg(metavar="RUNS", help_behavior_hint="(required)")
     ]
     """Folders of runs, folders that contain runs (such as a sweep's), or files of results, NAME.json.gz."""
-    out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    out: Out = None
     """The file to write, with or without the suffix. None: KIND in the current folder. Figures are written as .png and
     .pdf, tables as .md and .tex."""
     actions: Literal["sampled", "mode"] = "sampled"

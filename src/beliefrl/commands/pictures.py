@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from beliefrl.commands.arguments import Best, OwnAgent, own_agent, parse
+from beliefrl.commands.arguments import Best, Out, OwnAgent, own_agent, parse
 
 SPARING = 20.0  # maximum frames per second of a demo's video, so that it is written in seconds
 
@@ -22,7 +22,7 @@ class PredictOptions:
 
     run: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
-    out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    out: Out = None
     """The picture to write, as PNG and as PDF. None: predictions.png in the run's folder."""
     model: str | None = None
     """The model to use: keep or first for vrm, latent for slac. None: the first of these that the agent has."""
@@ -76,7 +76,7 @@ class FilmOptions:
         tyro.conf.Positional[tuple[pathlib.Path, ...]], tyro.conf.arg(metavar="RUN", help_behavior_hint="(required)")
     ]
     """The folders of the runs."""
-    out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    out: Out = None
     """The strip to write, as PNG and as PDF. None: film.png in the first run's folder."""
     frames: int = 8
     """Number of frames in a row."""
