@@ -27,10 +27,11 @@ def ours() -> float:
     from beliefrl import agents
     from beliefrl.training import phases
     from beliefrl.training.bench import Noise
+    from beliefrl.training.rounds import stretch_length
 
     agent = agents.make("vrm")
     program = phases.compile_program(agent, Noise(OBS, ACTIONS), capacity=EPISODES * LENGTH, episodes=1)
-    seeds, stretch = program.begin(jax.random.split(jax.random.key(0), 1)), phases.stretch_length(agent)
+    seeds, stretch = program.begin(jax.random.split(jax.random.key(0), 1)), stretch_length(agent)
     explored = EPISODES * LENGTH
     for step in range(0, explored, stretch):
         seeds, _ = program.explore(seeds, step, stretch)

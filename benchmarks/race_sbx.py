@@ -23,11 +23,12 @@ def ours() -> float:
 
     from beliefrl import agents, tasks
     from beliefrl.training import phases
+    from beliefrl.training.rounds import stretch_length
 
     agent, task = agents.make("sac-mlp", step_start_rl=1_000), tasks.make("pendulum")
     program = phases.compile_program(agent, task, capacity=1_000_000, episodes=1)
     seeds, step = program.begin(jax.random.split(jax.random.key(0), 1)), 0
-    stretch = phases.stretch_length(agent)
+    stretch = stretch_length(agent)
     while step < agent.step_start_rl:
         seeds, _ = program.explore(seeds, step, stretch)
         step += stretch

@@ -1,7 +1,8 @@
-"""How fast trainings run: in both loops, with several environments, with a program per core, with rounded products.
+"""How fast trainings run: in both loops, with slow environments, with a program per core, with rounded products.
 
     python benchmarks/throughput.py host-loop          # the host loop and the compiled loop
     python benchmarks/throughput.py envs               # a slow Gymnasium environment, by the number of environments
+    python benchmarks/throughput.py overlap            # a slow Gymnasium environment, with updates during its steps
     python benchmarks/throughput.py cores [AGENT ...]  # one program on all cores, and one per core
     python benchmarks/throughput.py precision [AGENT ...]  # products in float32 and in bfloat16
     python benchmarks/throughput.py burn-in            # vrm with shorter burn-ins
@@ -28,6 +29,7 @@ from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import host_loop as loop
 from beliefrl.training import phases
 from beliefrl.training.bench import Noise
+from beliefrl.training.rounds import stretch_length
 
 NAMES = ("vrm", "predictive-sac", "sac-mlp", "sac-lstm", "slac")
 
@@ -81,7 +83,7 @@ def host_loop(
     print(f"{'agent':<16}{'compiled':>10}{'host':>10}{'ratio':>8}   ms/step without the environment; {seeds} seeds")
     for name in names:
         agent = agents.make(name)
-        stretch = phases.stretch_length(agent)
+        stretch = stretch_length(agent)
         programs = (
             phases.compile_program(agent, Noise(obs, actions), capacity, 1),
             loop.program(agent, environment, capacity, 1, range(seeds), "never"),
@@ -146,6 +148,61 @@ def envs() -> None:
         print(f"{number} environments: {steps_per_second(number):.1f} steps per second", flush=True)
 
 
+# overlap
+
+
+class SlowEnvironment(NoiseEnvironment):
+    """Waits in each step, as if for a robot."""
+
+    def __init__(self, obs: int, actions: int, wait: float):
+        super().__init__(obs, actions)
+        self.wait = wait
+
+    def step(self, action):
+        time.sleep(self.wait)
+        return super().step(action)
+
+
+def overlap(
+    names: tuple[str, ...] = ("vrm", "predictive-sac", "sac-mlp"),
+    waits: tuple[float, ...] = (0.0, 0.005, 0.02),
+    rounds: int = 5,
+) -> None:
+    """Compare the time of a step with and without --overlap, in environments that wait in each step.
+
+    Both train in turn, at the sizes of velocities-only Hopper. Prints medians in milliseconds per step, which include
+    the time of the environment, and their ratio.
+
+    Args:
+        names: the agents.
+        waits: the time of a step of the environment, in seconds.
+        rounds: how often both are timed.
+    """
+    loop.keep_memory()  # as on the command line
+    keys = jax.random.split(jax.random.key(0), 1)
+    print(f"{'agent':<16}{'wait':>8}{'without':>10}{'with':>10}{'ratio':>8}   ms/step with the environment")
+    for name in names:
+        agent = agents.make(name)
+        stretch = stretch_length(agent)
+        for wait in waits:
+            environment = GymnasiumTask(SlowEnvironment, "slow", {"obs": 6, "actions": 3, "wait": wait}, max_steps=1000)
+            place = agent, environment, 125_000, 1, range(1), "never"
+            programs = [loop.program(*place, overlap=overlapping) for overlapping in (False, True)]
+            states = [program.explore(program.begin(keys), 0, stretch)[0] for program in programs]
+            times: tuple[list[float], list[float]] = ([], [])
+            for number in range(rounds + 1):
+                for index, program in enumerate(programs):
+                    before, first = time.perf_counter(), stretch * (number + 1)
+                    learned, _ = program.learn(states[index], first, stretch // agent.cycle)
+                    states[index] = jax.block_until_ready(learned)
+                    times[index].append(1e3 * (time.perf_counter() - before) / stretch)
+            without, overlapped = (statistics.median(each[1:]) for each in times)  # the first compiles
+            row = f"{1e3 * wait:>8.0f}{without:>10.2f}{overlapped:>10.2f}{overlapped / without:>8.3f}"
+            print(f"{name:<16}{row}", flush=True)
+            for program in programs:
+                program.close()
+
+
 # cores
 
 REPEATED = 3
@@ -196,12 +253,12 @@ def times_in_turn(trainings, rounds: int, seeds: int = 1) -> list[list[float]]:
     programs = {agent: phases.compile_program(agent, Noise(6, 3), 125_000, 1) for agent, _ in trainings}
     states, times = [], []
     for agent, _ in trainings:
-        program, stretch = programs[agent], phases.stretch_length(agent)
+        program, stretch = programs[agent], stretch_length(agent)
         states.append(program.explore(program.begin(keys), 0, stretch)[0])
     for number in range(rounds + 1):
         times.append([])
         for index, (agent, kind) in enumerate(trainings):
-            stretch = phases.stretch_length(agent)
+            stretch = stretch_length(agent)
             with jax.default_matmul_precision(kind):
                 before, first = time.perf_counter(), stretch * (number + 1)
                 learned, _ = programs[agent].learn(states[index], first, stretch // agent.cycle)
@@ -260,5 +317,12 @@ def burn_in(rounds: int = 9) -> None:
 
 if __name__ == "__main__":
     tyro.extras.subcommand_cli_from_dict(
-        {"host-loop": host_loop, "envs": envs, "cores": cores, "precision": precision, "burn-in": burn_in}
+        {
+            "host-loop": host_loop,
+            "envs": envs,
+            "overlap": overlap,
+            "cores": cores,
+            "precision": precision,
+            "burn-in": burn_in,
+        }
     )

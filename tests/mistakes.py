@@ -58,6 +58,7 @@ MISTAKES = {
     f"{TRAIN} --stop-at high": "--stop-at must be a number, not 'high'",
     f"{TRAIN} --stop-at nan": "stop_at=nan is impossible",
     f"{TRAIN} --stop-patience 0": "stop_patience=0 is impossible: it must be a whole number of at least 1",
+    f"{TRAIN} --overlap": "overlap needs a Gymnasium environment",
     f"{TRAIN} --step-timeout 0": "step_timeout=0.0 is impossible",
     f"{TRAIN} --step-timeout 5 --processes never": "step_timeout needs a process for each environment",
     f"{TRAIN} --init-from missing": "no run folder missing",

@@ -11,7 +11,7 @@ import pytest
 
 from beliefrl import UserError, agents, resume, tasks, train
 from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
-from beliefrl.training import host_loop, lockstep, phases, schedule
+from beliefrl.training import host_loop, lockstep, phases, rounds, schedule
 from beliefrl.training import replay as ring
 from beliefrl.training.lockstep import Lockstep
 from beliefrl.training.schedule import Options, _processes, stages
@@ -72,7 +72,7 @@ def test_readers_go_on_through_pretraining_and_every_cycle(envs, hosted):
     seeds, pretrained = program.pretrain(seeds, 0, 6)
     before = np.asarray(seeds.state.offset)
     np.testing.assert_array_equal(seeds.readers.turn, 30 % 16)
-    seeds, learned = program.learn(seeds, 60, 60 // phases.round_length(agent, envs))
+    seeds, learned = program.learn(seeds, 60, 60 // rounds.round_length(agent, envs))
     np.testing.assert_array_equal(seeds.readers.turn, 150 % 16)
     for broken in (pretrained["broken"], learned.metrics["broken"], learned.metrics["jumped"]):
         np.testing.assert_array_equal(broken, 0)
@@ -94,7 +94,7 @@ def test_there_are_as_many_updates_per_step_as_with_one_environment():
         program = phases.compile_program(Updates(), Counting(), 90, 1, envs)
         seeds = program.begin(jax.random.split(jax.random.key(0), 1))
         seeds, _ = program.explore(seeds, 0, 12)
-        seeds, _ = program.learn(seeds, 12, 48 // phases.round_length(Updates(), envs))
+        seeds, _ = program.learn(seeds, 12, 48 // rounds.round_length(Updates(), envs))
         counts.append(float(seeds.state.offset[0]))
     assert counts == [24, 24]  # two batches in a cycle of 4 steps
 
@@ -113,7 +113,7 @@ def test_environments_of_a_seed_begin_and_act_differently():
 def test_the_host_loop_learns_what_the_compiled_loop_learns():
     agent = agents.make("sac-mlp", **SHARED, batch_size=8, pretrain_updates=10)
     task, keys = Hanging(max_steps=9), jax.random.split(jax.random.key(0), 2)
-    stretches = {"learn": (20, 40), "cuts": (10, 10), "cycle": phases.round_length(agent, 2)}
+    stretches = {"learn": (20, 40), "cuts": (10, 10), "cycle": rounds.round_length(agent, 2)}
     there, log = trained(phases.compile_program(agent, task, 100, 2, 2), keys, **stretches)
     wrapped = GymnasiumTask(Wrapped, "wrapped", {"task": task})
     program = host_loop.program(agent, wrapped, 100, 2, range(2), "never", envs=2)

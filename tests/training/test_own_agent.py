@@ -238,7 +238,7 @@ def test_two_metrics_of_one_name_are_refused():
     agent = Twice()
     seed = phases.begin(agent, Counting(), 100, jax.random.key(0))
     with pytest.raises(UserError, match="both return a metric 'valid'"):
-        jax.eval_shape(lambda seed: phases.learn_cycle(agent, seed, jnp.array(10)), seed)
+        jax.eval_shape(lambda seed: phases.learn_round(agent, seed, jnp.array(10)), seed)
 
 
 # What a task measures of an episode goes everywhere by itself.

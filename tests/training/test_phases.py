@@ -90,7 +90,7 @@ def test_an_update_is_made_for_every_batch_and_no_two_have_one_key():
     agent = KeyKeeper()
     seed = phases.begin(agent, Counting(), 100, jax.random.key(0))
     for first in range(10, 10 + 12 * agent.cycle, agent.cycle):
-        seed, _ = phases.learn_cycle(agent, seed, jnp.array(first))
+        seed, _ = phases.learn_round(agent, seed, jnp.array(first))
     assert len({tuple(key) for key in np.array(seed.state.seen).tolist()}) == 120
     assert np.array(seed.state.seen).any(axis=1).all()
 

@@ -25,6 +25,9 @@ class Options:
     envs: int = 1
     """Environments of each seed, which step together. Steps are counted over all of them, and the updates per step stay
     the same. With a slow Gymnasium environment and several cores, more environments make the training faster."""
+    overlap: bool = False
+    """Make the updates while the Gymnasium environments step. The agent then acts with the weights from before the last
+    updates. This makes the training faster if the environments wait, as robots and slow simulators do."""
     eval_every: int = 2_000
     """Environment steps between two evaluations (Appendix B)."""
     eval_episodes: int = 5
@@ -73,6 +76,7 @@ class Options:
         check_choice(self, "processes", get_args(Processes))
         check_choice(self, "precision", get_args(Precision))
         check_choice(self, "init_best", (True, False))
+        check_choice(self, "overlap", (True, False))
         if self.stop_at is not None:
             check_range(self, ("stop_at",), -LARGEST)
         if self.init_from is not None and (not isinstance(self.init_from, str) or not self.init_from):

@@ -23,6 +23,7 @@ from beliefrl.runs.options import Precision
 from beliefrl.training import phases
 from beliefrl.training import replay as ring
 from beliefrl.training.rounding import at_precision
+from beliefrl.training.rounds import stretch_length
 from beliefrl.training.schedule import Options, capacity
 from beliefrl.types import Spec, UserError, check_range
 
@@ -136,7 +137,7 @@ def bench(
 
 
 def _bench(agent: Agent, obs: int, actions: int, seeds: int, started: float) -> dict[str, Any]:
-    stretch = phases.stretch_length(agent)
+    stretch = stretch_length(agent)
     cycles = stretch // agent.cycle
     timed = _Timed(agent, Noise(obs, actions), seeds)
     first = [timed.explore(stretch), timed.pretrain(1) if agent.pretrain_updates else 0.0, timed.learn(1)]

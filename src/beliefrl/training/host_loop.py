@@ -1,11 +1,15 @@
 """Algorithm 1 with Gymnasium environments, which run on the host: the same phases as in `phases`.
 
-The agent acts, records and learns with the same functions as in the compiled loop. Only the step of the task is
-outside. A call of a compiled function takes as much time as acting, so there is one call for each environment step:
+Only the step of the task is outside of what is compiled (`host_steps`). A call of a compiled function takes as much
+time as acting, so there is one call for each environment step:
 
     act             the first action of a stretch of steps
     environments    a step, in lockstep
-    go on           record their results; when a cycle's steps are done, learn (`phases.learn_cycle`); act again
+    go on           record their results; when a round's steps are done, learn (`phases.learn_round`); act again
+
+With the option `overlap`, a second thread makes the updates while the environments step. The steps of a round are then
+chosen with the weights from before the updates of the round before. So what is learned does not depend on how long a
+step or an update takes. A stretch begins and ends with the newest weights.
 
 If an environment fails, the training ends. What was learned and recorded until then is saved.
 """
@@ -13,23 +17,25 @@ If an environment fails, the training ends. What was learned and recorded until 
 import ctypes
 import sys
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Key
 
 from beliefrl.agents import Agent
 from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
-from beliefrl.training import phases, rollout
+from beliefrl.training import host_steps, phases, rollout
 from beliefrl.training.host_evaluation import Evaluation
+from beliefrl.training.host_steps import ActorOutput, StepResult
+from beliefrl.training.keys import REVIVE, step_key
 from beliefrl.training.lockstep import Lockstep, environment_seeds
-from beliefrl.training.phases import REVIVE, Metrics, Program, SeedState, Stretch, step_key
-from beliefrl.training.replay import Replay
-from beliefrl.training.rollout import ActorState, Episode
-from beliefrl.types import Spec
+from beliefrl.training.phases import Program, SeedState, Stretch
+from beliefrl.training.rollout import Episode
+from beliefrl.training.rounds import Metrics, round_length
 
 
 def program(
@@ -42,18 +48,19 @@ def program(
     notify: Callable[[str], None] | None = None,
     timeout: float | None = None,
     envs: int = 1,
+    overlap: bool = False,
 ) -> Program:
     """The phases of training, with `envs` environments for each of `seeds`.
 
-    `processes`, `notify` and `timeout` are those of `Lockstep`.
+    `processes`, `notify` and `timeout` are those of `Lockstep`. With `overlap`, updates are made during steps.
     """
     copies = [""] if envs == 1 else [f", environment {copy}" for copy in range(envs)]
     lanes = [f"seed {seed}{copy}" for seed in seeds for copy in copies]
-    loop = HostLoop(agent, task, capacity, Lockstep(task, lanes, processes, notify, timeout), envs)
+    loop = HostLoop(agent, task, capacity, Lockstep(task, lanes, processes, notify, timeout), envs, overlap)
     evaluation = Evaluation(agent, task, seeds, processes, notify, timeout)
 
     def close() -> None:
-        loop.environments.close()
+        loop.close()
         evaluation.close()
 
     return Program(
@@ -83,38 +90,37 @@ def keep_memory() -> None:
             libc.mallopt(trim_threshold, most)
 
 
-class ActorOutput(NamedTuple):
-    """What the agent returns at the current timestep."""
-
-    action: Float[Array, "*lanes action"]
-    memory: Any  # after that timestep
-
-
-class StepResult(NamedTuple):
-    """What the agent returned, and what its environments returned. *lanes* is (seed,), or (seed, env) with several."""
-
-    output: ActorOutput
-    obs: Any  # (*lanes, obs)
-    reward: Any  # lanes
-    terminated: Any  # lanes
-    done: Any  # lanes
-    measures: dict[str, Any]  # leaves of shape lanes
-    fresh: Any  # (*lanes, obs), the first observation of the next episode where done
-
-
 class HostLoop:
     """The environments of a training, and what is compiled around them."""
 
-    def __init__(self, agent: Agent, task: GymnasiumTask, capacity: int, environments: Lockstep, envs: int = 1):
-        """`environments` has `envs` for each seed."""
+    def __init__(
+        self,
+        agent: Agent,
+        task: GymnasiumTask,
+        capacity: int,
+        environments: Lockstep,
+        envs: int = 1,
+        overlap: bool = False,
+    ):
+        """`environments` has `envs` for each seed; with `overlap`, updates are made during their steps."""
         self.agent, self.spec, self.environments, self.envs = agent, task.spec, environments, envs
+        self.learner = ThreadPoolExecutor(1, "learner") if overlap else None
         first = phases.on_each_env(envs, lambda obs: rollout.first(agent, task.spec, (), obs))
-        self._begin = jax.jit(jax.vmap(partial(_begin, agent, task.spec, capacity, envs)))
+        sizes = agent, task.spec, envs
+        on_seeds = partial(jax.vmap, in_axes=(0, 0, 0, None))
+        self._begin = jax.jit(jax.vmap(partial(host_steps.begin, agent, task.spec, capacity, envs)))
         self._first = jax.jit(jax.vmap(first))
-        self._act = jax.jit(jax.vmap(partial(_act, agent, envs), in_axes=(0, None)))
-        go_on, learn = partial(_go_on, agent, task.spec, envs), partial(_learn, agent, task.spec, envs)
-        self._go_on: Any = jax.jit(jax.vmap(go_on, in_axes=(0, 0, 0, None)), donate_argnums=1)
-        self._learn: Any = jax.jit(jax.vmap(learn, in_axes=(0, 0, None)), donate_argnums=0)
+        self._act = jax.jit(jax.vmap(partial(host_steps.act, agent, envs), in_axes=(0, None)))
+        self._go_on: Any = jax.jit(on_seeds(partial(host_steps.go_on, *sizes)), donate_argnums=1)
+        self._learn: Any = jax.jit(jax.vmap(partial(host_steps.learn, *sizes), in_axes=(0, 0, None)), donate_argnums=0)
+        self._end_round: Any = jax.jit(on_seeds(partial(host_steps.end_round, *sizes)), donate_argnums=1)
+        self._update: Any = jax.jit(on_seeds(partial(host_steps.update, agent, envs)))  # the old state acts meanwhile
+
+    def close(self) -> None:
+        """End the environments, and the thread of the updates."""
+        self.environments.close()
+        if self.learner is not None:
+            self.learner.shutdown()
 
     def begin(self, keys: Key[Array, " seed"]) -> SeedState:
         """Seeds before their first steps."""
@@ -148,29 +154,48 @@ class HostLoop:
             self._compile(seeds, output, learns=False)
         for step in range(first, first + steps, self.envs):
             result = self._step(seeds, output, step, log)
-            seeds, output, episode = self._proceed(seeds, result, step)
+            seeds, output, episode = self._proceed(seeds, result, step, seeds.state)
             log.episodes.append(episode)
         return seeds, log.stretch()
 
     def learn(self, seeds: SeedState, first: int, rounds: int) -> tuple[SeedState, Stretch]:
         """`rounds` rounds of steps and updates from environment step `first` on; 0 only compiles."""
-        log, output, length = _StretchLog(), self._act(seeds, first), phases.round_length(self.agent, self.envs)
+        log, output, length = _StretchLog(), self._act(seeds, first), round_length(self.agent, self.envs)
         if rounds == 0:
             self._compile(seeds, output, learns=True)
+        acting = seeds.state
         for step in range(first, first + rounds * length, self.envs):
             result = self._step(seeds, output, step, log)
             if (step + self.envs - first) % length:
-                seeds, output, episode = self._proceed(seeds, result, step)
+                seeds, output, episode = self._proceed(seeds, result, step, acting)
             else:
-                seeds, output, episode, metrics = self._learn(seeds, result, step)
+                before = seeds.state
+                seeds, output, episode, metrics = self._finish(seeds, result, step)
+                acting = before if self.learner else seeds.state
                 log.metrics.append(metrics)
             log.episodes.append(episode)
         return seeds, log.stretch()
 
-    def _proceed(self, seeds: SeedState, result: StepResult, step: int) -> tuple[SeedState, ActorOutput, Episode]:
-        """Record the results of a step, and act again; the agent's state stays as it is."""
-        rest, output, episode = self._go_on(seeds.state, seeds._replace(state=()), result, step)
+    def _proceed(
+        self, seeds: SeedState, result: StepResult, step: int, acting: Any
+    ) -> tuple[SeedState, ActorOutput, Episode]:
+        """Record the results of a step, and act again with the agent's state `acting`; its newest state stays."""
+        rest, output, episode = self._go_on(acting, seeds._replace(state=()), result, step)
         return rest._replace(state=seeds.state), output, episode
+
+    def _finish(
+        self, seeds: SeedState, result: StepResult, step: int
+    ) -> tuple[SeedState, ActorOutput, Episode, Metrics]:
+        """Record the last step of a round, learn, and act again; with a learner, act without waiting for the updates.
+
+        JAX makes the calls of one thread in order, on a CPU too. So the updates need a thread of their own.
+        """
+        if self.learner is None:
+            return self._learn(seeds, result, step)
+        state = seeds.state
+        rest, output, episode, windows = self._end_round(state, seeds._replace(state=()), result, step)
+        state, metrics = self.learner.submit(self._update, state, windows, rest.key, step).result()
+        return rest._replace(state=state), output, episode, metrics
 
     def _compile(self, seeds: SeedState, output: ActorOutput, learns: bool) -> None:
         """Compile what follows a step of the environments: else a compilation would look like a slow environment."""
@@ -181,12 +206,15 @@ class HostLoop:
             np.zeros(lanes, bool),
         )
         result = StepResult(output, obs, number, never, never, dict.fromkeys(self.spec.measures, number), obs)
-        single = phases.round_length(self.agent, self.envs) == self.envs  # updates after every step
-        if isinstance(self._go_on, jax.stages.Wrapped) and not (learns and single):
-            rest = seeds._replace(state=())
+        single, rest = round_length(self.agent, self.envs) == self.envs, seeds._replace(state=())
+        if isinstance(self._go_on, jax.stages.Wrapped) and not (learns and single):  # single: updates after every step
             self._go_on = self._go_on.lower(seeds.state, rest, result, 0).compile()
-        if learns:
+        if learns and self.learner is None:
             self._learn = self._learn.lower(seeds, result, 0).compile()
+        elif learns:
+            windows = jax.eval_shape(self._end_round, seeds.state, rest, result, 0)[-1]
+            self._end_round = self._end_round.lower(seeds.state, rest, result, 0).compile()
+            self._update = self._update.lower(seeds.state, windows, seeds.key, 0).compile()
 
     def _step(self, seeds: SeedState, output: ActorOutput, step: int, log: "_StretchLog") -> StepResult:
         """One step of every environment."""
@@ -220,64 +248,3 @@ class _StretchLog:
         means = jax.tree.map(lambda *each: np.mean(each, axis=0), *metrics) if metrics else {}
         columns = jax.tree.map(lambda *each: np.stack(each, axis=1), *episodes) if episodes else None
         return Stretch(means, jax.tree.map(lambda column: column.reshape(len(column), -1), columns))
-
-
-def _begin(
-    agent: Agent, spec: Spec, capacity: int, envs: int, key: Key[Array, ""], obs: Float[Array, "*env obs"]
-) -> SeedState:
-    key_state, _, key = jax.random.split(key, 3)
-    actor = phases.on_each_env(envs, lambda obs: rollout.first(agent, spec, (), obs))(obs)
-    return phases.seed_of(agent, spec, capacity, actor, key_state, key, envs)
-
-
-def _act(agent: Agent, envs: int, seed: SeedState, step: Int[Array, ""]) -> ActorOutput:
-    def act(actor: ActorState, key: Key[Array, ""]) -> ActorOutput:
-        key_move, _, _ = jax.random.split(key, 3)
-        return ActorOutput(*rollout.act(agent, seed.state, actor, key_move, jnp.array(True)))
-
-    return phases.on_each_env(envs, act)(seed.actor, phases.acting_keys(seed.key, step, envs))
-
-
-def _record(
-    agent: Agent, spec: Spec, envs: int, seed: SeedState, result: StepResult, step: Int[Array, ""]
-) -> tuple[SeedState, Episode]:
-    """Record the results of this step.
-
-    The replay is written in a loop whose length XLA does not know: else XLA copies the whole ring (`phases._round`).
-    """
-
-    def arrive(actor: ActorState, result: StepResult) -> ActorState:
-        action, memory = result.output
-        return rollout.arrive(actor, memory, action, (), result.obs, result.reward, result.terminated)
-
-    def record(
-        actor: ActorState, replay: Replay, after: ActorState, result: StepResult, key: Key[Array, ""]
-    ) -> tuple[ActorState, Replay]:
-        _, key_last, _ = jax.random.split(key, 3)
-        fresh = rollout.first(agent, spec, (), result.fresh)
-        return rollout.record(agent, seed.state, replay, actor, after, fresh, result.done, key_last)
-
-    def once(_, carry):
-        return phases.on_each_env(envs, record)(*carry, after, result, keys)
-
-    keys, after = phases.acting_keys(seed.key, step, envs), phases.on_each_env(envs, arrive)(seed.actor, result)
-    actor, replay = jax.lax.fori_loop(step, step + 1, once, (seed.actor, seed.replay))
-    episode = Episode(result.done, after.episode_return, after.length, result.measures)
-    return seed._replace(actor=actor, replay=replay), episode
-
-
-def _go_on(
-    agent: Agent, spec: Spec, envs: int, state: Any, rest: SeedState, result: StepResult, step: Int[Array, ""]
-) -> tuple[SeedState, ActorOutput, Episode]:
-    """Record, and act again."""
-    seed, episode = _record(agent, spec, envs, rest._replace(state=state), result, step)
-    return seed._replace(state=()), _act(agent, envs, seed, step + envs), episode
-
-
-def _learn(
-    agent: Agent, spec: Spec, envs: int, seed: SeedState, result: StepResult, step: Int[Array, ""]
-) -> tuple[SeedState, ActorOutput, Episode, Metrics]:
-    """Record the last step of a round, learn, and act again."""
-    seed, episode = _record(agent, spec, envs, seed, result, step)
-    seed, metrics = phases.learn_round(agent, seed, step + envs - phases.round_length(agent, envs), envs)
-    return seed, _act(agent, envs, seed, step + envs), episode, metrics

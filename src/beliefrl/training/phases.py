@@ -17,36 +17,24 @@ Learning goes on in rounds: the fewest steps that are whole cycles and whole ste
 updates of these cycles. With one environment a round is a cycle, and there is no axis `env`.
 """
 
-import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Int, Key
 
 from beliefrl.agents import Agent
 from beliefrl.tasks import Task
 from beliefrl.training import replay as ring
-from beliefrl.training import rollout
+from beliefrl.training import rollout, rounds
+from beliefrl.training.keys import PRETRAIN, REFRESH, acting_keys, step_key
 from beliefrl.training.replay import Readers, Replay
 from beliefrl.training.rollout import ActorState, Episode
 from beliefrl.training.rounding import at_precision
-from beliefrl.types import Spec, UserError
-
-Metrics = dict[str, Float[Array, "..."]]
-
-
-def round_length(agent: Agent, envs: int = 1) -> int:
-    """Environment steps of a round of learning, summed over the environments of a seed."""
-    return math.lcm(agent.cycle, envs)
-
-
-def stretch_length(agent: Agent, envs: int = 1) -> int:
-    """Environment steps between two entries of the log, at most: whole rounds, about 100 steps."""
-    length = round_length(agent, envs)
-    return max(100 // length, 1) * length
+from beliefrl.training.rounds import Metrics, round_length, stretch_length
+from beliefrl.types import Spec
 
 
 def on_each_env(envs: int, function: Callable[..., Any]) -> Callable[..., Any]:
@@ -103,20 +91,6 @@ def _write(log: Episode, index: Int[Array, ""], episode: Episode) -> Episode:
         return column.at[index].set(entry)
 
     return jax.tree.map(write, log, episode)
-
-
-def step_key(key: Key[Array, ""], step: Int[Array, ""], purpose: int) -> Key[Array, ""]:
-    return jax.random.fold_in(jax.random.fold_in(key, purpose), step)
-
-
-def acting_keys(key: Key[Array, ""], step: Int[Array, ""], envs: int) -> Key[Array, "*env"]:
-    """The key of each environment for its step; the environments' steps have the numbers from `step` on."""
-    if envs == 1:
-        return step_key(key, step, ACT)
-    return jax.vmap(lambda env: step_key(key, step + env, ACT))(jnp.arange(envs))
-
-
-ACT, UPDATE, SAMPLE, CYCLE, PRETRAIN, REFRESH, EVALUATE, REVIVE = range(8)  # purposes of keys: no two share one
 
 
 def explore(
@@ -220,43 +194,9 @@ def _round(
 
 def learn_round(agent: Agent, seed: SeedState, first: Int[Array, ""], envs: int = 1) -> tuple[SeedState, Metrics]:
     """The updates after the steps of the round that began at environment step `first`; metrics are their means."""
-    cycles = round_length(agent, envs) // agent.cycle
-    if cycles == 1:
-        return learn_cycle(agent, seed, first)
-
-    def cycle(learned, number):  # the scan carries what learning changes: else XLA copies the ring
-        state, readers = learned
-        before = seed._replace(state=state, readers=readers)
-        after, metrics = learn_cycle(agent, before, first + number * agent.cycle)
-        return (after.state, after.readers), metrics
-
-    (state, readers), metrics = jax.lax.scan(cycle, (seed.state, seed.readers), jnp.arange(cycles))
-    return seed._replace(state=state, readers=readers), jax.tree.map(lambda each: jnp.mean(each, axis=0), metrics)
-
-
-def learn_cycle(agent: Agent, seed: SeedState, first: Int[Array, ""]) -> tuple[SeedState, Metrics]:
-    """The updates after the steps of the cycle that began at environment step `first`, and their metrics.
-
-    Raises:
-        UserError: `begin_cycle` and `update` return a metric of the same name.
-    """
-    key = step_key(seed.key, first, SAMPLE)
-    windows, readers = ring.windows(seed.replay, seed.readers, key, agent.cycle_windows, agent.window)
-    begin_cycle = at_precision(agent.begin_cycle)
-    state, batches, model_metrics = begin_cycle(seed.state, windows, step_key(seed.key, first, CYCLE))
-
-    count = len(jax.tree.leaves(batches)[0])
-    begun = first * -(-count // agent.cycle)  # no two updates share a key
-
-    def update(state, inputs):
-        number, batch = inputs
-        return at_precision(agent.update)(state, batch, step_key(seed.key, begun + number, UPDATE))
-
-    updates = jnp.arange(count)
-    state, metrics = jax.lax.scan(update, state, (updates, batches))
-    for name in model_metrics.keys() & metrics.keys():
-        raise UserError(f"begin_cycle and update of the agent both return a metric {name!r}: rename one of them.")
-    return seed._replace(state=state, readers=readers), model_metrics | jax.tree.map(jnp.mean, metrics)
+    windows, readers = rounds.draw(agent, seed.replay, seed.readers, seed.key, first, envs)
+    state, metrics = rounds.learn(agent, seed.state, windows, seed.key, first, envs)
+    return seed._replace(state=state, readers=readers), metrics
 
 
 def evaluate(agent: Agent, task: Task, state: Any, key: Key[Array, ""], episodes: int) -> Episode:

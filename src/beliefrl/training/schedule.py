@@ -9,15 +9,17 @@ from collections.abc import Callable, Generator, Iterator
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from beliefrl.agents import Agent
 from beliefrl.runs.options import Options, Processes
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
-from beliefrl.training import host_loop, phases
-from beliefrl.training.phases import Metrics, Program, SeedState
+from beliefrl.training import host_loop, keys, phases
+from beliefrl.training.phases import Program, SeedState
 from beliefrl.training.rollout import Episode
+from beliefrl.training.rounds import Metrics, round_length, stretch_length
 from beliefrl.types import UserError
 
 
@@ -111,17 +113,18 @@ def stages(
         if own_process:
             host_loop.keep_memory()
         processes = _processes(options, own_process)
-        program = host_loop.program(agent, task, *sizes, numbers, processes, notify, options.step_timeout, options.envs)
+        how = options.step_timeout, options.envs, options.overlap
+        program = host_loop.program(agent, task, *sizes, numbers, processes, notify, *how)
     else:
         program = phases.compile_program(agent, task, *sizes, options.envs)
-    keys, at = jax.vmap(jax.random.key)(np.array(numbers)), TrainingProgress(refreshed=initial is not None)
+    of_seeds, at = jax.vmap(jax.random.key)(np.array(numbers)), TrainingProgress(refreshed=initial is not None)
     try:
         if restore is None:
             yield Event(Phase.COMPILING_AGENT, 0)
-            seeds = program.begin(keys)
+            seeds = program.begin(of_seeds)
             seeds = seeds if initial is None else seeds._replace(state=initial(seeds.state))
         else:
-            at, seeds = restore(program.shapes(keys))
+            at, seeds = restore(program.shapes(of_seeds))
             seeds = program.revive(seeds, at.step)
         for event in _stages(agent, program, options, at, seeds):
             at = at if event.snapshot is None else event.snapshot.progress
@@ -142,9 +145,9 @@ def stages(
 def _stages(
     agent: Agent, program: Program, options: Options, at: TrainingProgress, seeds: SeedState
 ) -> Iterator[Event]:
-    envs, length = options.envs, phases.round_length(agent, options.envs)
+    envs, length = options.envs, round_length(agent, options.envs)
     explored = min(agent.step_start_rl, options.steps)
-    stretch = phases.stretch_length(agent, envs)
+    stretch = stretch_length(agent, envs)
 
     if at.evaluated // options.eval_every < at.step // options.eval_every:  # an environment failed in this evaluation
         yield from _evaluation(agent, program, seeds, at.step, Phase.LEARNING)
@@ -236,9 +239,9 @@ def _until(step: int, every: int) -> int:
 
 def _evaluation(agent: Agent, program: Program, seeds: SeedState, step: int, then: Phase) -> Iterator[Event]:
     yield Event(Phase.EVALUATING, step)
-    keys = jax.vmap(lambda key: jax.random.fold_in(jax.random.fold_in(key, phases.EVALUATE), step))(seeds.key)
+    of_step = jax.vmap(lambda key: keys.step_key(key, jnp.asarray(step), keys.EVALUATE))
     try:
-        result = program.evaluate(agent.networks(seeds.state), keys)
+        result = program.evaluate(agent.networks(seeds.state), of_step(seeds.key))
     except Fault as fault:
         fault.seeds, fault.step = seeds, step
         raise

@@ -55,9 +55,9 @@ def train(
             for each phase and each evaluation, and at least one per minute. False shows nothing.
         resume: continue the training in `out`, if there is one already. It must have been started with the same
             agent, task and options. `steps` may be larger; stop_at, stop_patience and step_timeout may be different.
-        options: the fields of `Options`: steps, seeds, seed, eval_every, eval_episodes, stop_at, stop_patience,
-            init_from, init_best, replay_capacity, processes, step_timeout, checkpoint_steps, checkpoint_minutes,
-            keep_checkpoints, precision, track. init_from may be a Run.
+        options: the fields of `Options`: steps, seeds, seed, envs, overlap, eval_every, eval_episodes, stop_at,
+            stop_patience, init_from, init_best, replay_capacity, processes, step_timeout, checkpoint_steps,
+            checkpoint_minutes, keep_checkpoints, precision, track. init_from may be a Run.
 
     Returns:
         The run: its results, its log, its files (`runs`). It is finished, unless the callback has stopped it.
@@ -212,8 +212,13 @@ def _chosen(options: dict[str, Any]) -> Options:
 
 
 def _check_possible(options: Options, task: Any, own_process: bool) -> None:
-    """Raise a UserError if options need a package or processes that are not available."""
+    """Raise a UserError if options need a package, a kind of task or processes that are not available."""
     trackers.check(options.track)
+    if options.overlap and not isinstance(task, GymnasiumTask):
+        raise UserError(
+            "overlap needs a Gymnasium environment: a task in JAX is compiled together with the updates. Leave the "
+            "option out."
+        )
     if options.step_timeout and isinstance(task, GymnasiumTask) and options.processes == "auto" and not own_process:
         raise UserError(
             "step_timeout needs a process for each environment: from Python, give own_process=True, and guard the "
