@@ -114,7 +114,7 @@ class HostLoop:
         self._go_on: Any = jax.jit(on_seeds(partial(host_steps.go_on, *sizes)), donate_argnums=1)
         self._learn: Any = jax.jit(jax.vmap(partial(host_steps.learn, *sizes), in_axes=(0, 0, None)), donate_argnums=0)
         self._end_round: Any = jax.jit(on_seeds(partial(host_steps.end_round, *sizes)), donate_argnums=1)
-        self._update: Any = jax.jit(on_seeds(partial(host_steps.update, agent, envs)))  # the old state acts meanwhile
+        self._update: Any = jax.jit(jax.vmap(partial(host_steps.update, agent, envs), in_axes=(0, 0, None)))
 
     def close(self) -> None:
         """End the environments, and the thread of the updates."""
@@ -193,8 +193,8 @@ class HostLoop:
         if self.learner is None:
             return self._learn(seeds, result, step)
         state = seeds.state
-        rest, output, episode, windows = self._end_round(state, seeds._replace(state=()), result, step)
-        state, metrics = self.learner.submit(self._update, state, windows, rest.key, step).result()
+        rest, output, episode, lesson = self._end_round(state, seeds._replace(state=()), result, step)
+        state, metrics = self.learner.submit(self._update, state, lesson, step).result()
         return rest._replace(state=state), output, episode, metrics
 
     def _compile(self, seeds: SeedState, output: ActorOutput, learns: bool) -> None:
@@ -212,9 +212,9 @@ class HostLoop:
         if learns and self.learner is None:
             self._learn = self._learn.lower(seeds, result, 0).compile()
         elif learns:
-            windows = jax.eval_shape(self._end_round, seeds.state, rest, result, 0)[-1]
+            lesson = jax.eval_shape(self._end_round, seeds.state, rest, result, 0)[-1]
             self._end_round = self._end_round.lower(seeds.state, rest, result, 0).compile()
-            self._update = self._update.lower(seeds.state, windows, seeds.key, 0).compile()
+            self._update = self._update.lower(seeds.state, lesson, 0).compile()
 
     def _step(self, seeds: SeedState, output: ActorOutput, step: int, log: "_StretchLog") -> StepResult:
         """One step of every environment."""

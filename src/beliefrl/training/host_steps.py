@@ -26,6 +26,13 @@ class ActorOutput(NamedTuple):
     memory: Any  # after that timestep
 
 
+class Lesson(NamedTuple):
+    """What the updates of a round need besides the agent's state."""
+
+    windows: Window
+    key: Key[Array, "*seed"]  # the seed's, in memory of its own: the next step reuses that of the other
+
+
 class StepResult(NamedTuple):
     """What the agent returned, and what its environments returned. *lanes* is (seed,), or (seed, env) with several."""
 
@@ -101,18 +108,16 @@ def learn(
 
 def end_round(
     agent: Agent, spec: Spec, envs: int, state: Any, rest: SeedState, result: StepResult, step: Int[Array, ""]
-) -> tuple[SeedState, ActorOutput, Episode, Window]:
+) -> tuple[SeedState, ActorOutput, Episode, Lesson]:
     """Record the last step of a round, draw the windows for its updates, and act again without the updates."""
     rest, output, episode = go_on(agent, spec, envs, state, rest, result, step)
     windows, readers = rounds.draw(agent, rest.replay, rest.readers, rest.key, _first(agent, step, envs), envs)
-    return rest._replace(readers=readers), output, episode, windows
+    return rest._replace(readers=readers), output, episode, Lesson(windows, rest.key)
 
 
-def update(
-    agent: Agent, envs: int, state: Any, windows: Window, key: Key[Array, ""], step: Int[Array, ""]
-) -> tuple[Any, Metrics]:
+def update(agent: Agent, envs: int, state: Any, lesson: Lesson, step: Int[Array, ""]) -> tuple[Any, Metrics]:
     """The updates of the round that ended with this step."""
-    return rounds.learn(agent, state, windows, key, _first(agent, step, envs), envs)
+    return rounds.learn(agent, state, *lesson, _first(agent, step, envs), envs)
 
 
 def _first(agent: Agent, last: Int[Array, ""], envs: int) -> Int[Array, ""]:
