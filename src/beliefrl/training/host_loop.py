@@ -193,8 +193,8 @@ class HostLoop:
         if self.learner is None:
             return self._learn(seeds, result, step)
         state = seeds.state
-        rest, output, episode, lesson = self._end_round(state, seeds._replace(state=()), result, step)
-        state, metrics = self.learner.submit(self._update, state, lesson, step).result()
+        rest, output, episode, inputs = self._end_round(state, seeds._replace(state=()), result, step)
+        state, metrics = self.learner.submit(self._update, state, inputs, step).result()
         return rest._replace(state=state), output, episode, metrics
 
     def _compile(self, seeds: SeedState, output: ActorOutput, learns: bool) -> None:
@@ -212,9 +212,9 @@ class HostLoop:
         if learns and self.learner is None:
             self._learn = self._learn.lower(seeds, result, 0).compile()
         elif learns:
-            lesson = jax.eval_shape(self._end_round, seeds.state, rest, result, 0)[-1]
+            inputs = jax.eval_shape(self._end_round, seeds.state, rest, result, 0)[-1]
             self._end_round = self._end_round.lower(seeds.state, rest, result, 0).compile()
-            self._update = self._update.lower(seeds.state, lesson, 0).compile()
+            self._update = self._update.lower(seeds.state, inputs, 0).compile()
 
     def _step(self, seeds: SeedState, output: ActorOutput, step: int, log: "_StretchLog") -> StepResult:
         """One step of every environment."""

@@ -26,7 +26,7 @@ class ActorOutput(NamedTuple):
     memory: Any  # after that timestep
 
 
-class Lesson(NamedTuple):
+class UpdateInputs(NamedTuple):
     """What the updates of a round need besides the agent's state."""
 
     windows: Window
@@ -108,16 +108,16 @@ def learn(
 
 def end_round(
     agent: Agent, spec: Spec, envs: int, state: Any, rest: SeedState, result: StepResult, step: Int[Array, ""]
-) -> tuple[SeedState, ActorOutput, Episode, Lesson]:
+) -> tuple[SeedState, ActorOutput, Episode, UpdateInputs]:
     """Record the last step of a round, draw the windows for its updates, and act again without the updates."""
     rest, output, episode = go_on(agent, spec, envs, state, rest, result, step)
     windows, readers = rounds.draw(agent, rest.replay, rest.readers, rest.key, _first(agent, step, envs), envs)
-    return rest._replace(readers=readers), output, episode, Lesson(windows, rest.key)
+    return rest._replace(readers=readers), output, episode, UpdateInputs(windows, rest.key)
 
 
-def update(agent: Agent, envs: int, state: Any, lesson: Lesson, step: Int[Array, ""]) -> tuple[Any, Metrics]:
+def update(agent: Agent, envs: int, state: Any, inputs: UpdateInputs, step: Int[Array, ""]) -> tuple[Any, Metrics]:
     """The updates of the round that ended with this step."""
-    return rounds.learn(agent, state, *lesson, _first(agent, step, envs), envs)
+    return rounds.learn(agent, state, *inputs, _first(agent, step, envs), envs)
 
 
 def _first(agent: Agent, last: Int[Array, ""], envs: int) -> Int[Array, ""]:
