@@ -27,7 +27,7 @@ class Options:
     the same. With a slow Gymnasium environment and several cores, more environments make the training faster."""
     overlap: bool = False
     """Make the updates while the Gymnasium environments step. The agent then acts with the weights from before the last
-    updates. This makes the training faster if the environments wait, as robots and slow simulators do."""
+    updates. This makes the training faster if most of a step is waiting, for a robot or for another program."""
     eval_every: int = 2_000
     """Environment steps between two evaluations (Appendix B)."""
     eval_episodes: int = 5

@@ -7,9 +7,10 @@ time as acting, so there is one call for each environment step:
     environments    a step, in lockstep
     go on           record their results; when a round's steps are done, learn (`phases.learn_round`); act again
 
-With the option `overlap`, a second thread makes the updates while the environments step. The steps of a round are then
-chosen with the weights from before the updates of the round before. So what is learned does not depend on how long a
-step or an update takes. A stretch begins and ends with the newest weights.
+With the option `overlap`, a second thread starts the updates, and they run while the environments step. The steps of a
+round are then chosen with the weights from before the updates of the round before. So what is learned does not depend
+on how long a step or an update takes. The first round of a stretch acts with the newest weights. So it does depend on
+how the steps are divided into stretches, for instance on `eval_every`.
 
 If an environment fails, the training ends. What was learned and recorded until then is saved.
 """
@@ -118,9 +119,11 @@ class HostLoop:
 
     def close(self) -> None:
         """End the environments, and the thread of the updates."""
-        self.environments.close()
-        if self.learner is not None:
-            self.learner.shutdown()
+        try:
+            self.environments.close()
+        finally:
+            if self.learner is not None:
+                self.learner.shutdown()
 
     def begin(self, keys: Key[Array, " seed"]) -> SeedState:
         """Seeds before their first steps."""
@@ -188,7 +191,8 @@ class HostLoop:
     ) -> tuple[SeedState, ActorOutput, Episode, Metrics]:
         """Record the last step of a round, learn, and act again; with a learner, act without waiting for the updates.
 
-        JAX makes the calls of one thread in order, on a CPU too. So the updates need a thread of their own.
+        JAX runs the calls of one thread in order, on a CPU too. So a thread of its own starts the updates. `result`
+        returns when they have started, and the arrays are ready when they are done.
         """
         if self.learner is None:
             return self._learn(seeds, result, step)

@@ -1,6 +1,6 @@
 """The random keys of a training: from a seed's key, a purpose, and the number of a step or of an update.
 
-So no result depends on how the steps are divided into blocks.
+So no result depends on how the steps are divided into blocks, except with the option `overlap`.
 """
 
 import jax
