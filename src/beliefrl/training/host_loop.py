@@ -9,8 +9,8 @@ time as acting, so there is one call for each environment step:
 
 With the option `overlap`, a second thread starts the updates, and they run while the environments step. The steps of a
 round are then chosen with the weights from before the updates of the round before. So what is learned does not depend
-on how long a step or an update takes. The first round of a stretch acts with the newest weights. So it does depend on
-how the steps are divided into stretches, for instance on `eval_every`.
+on how long a step or an update takes. The first round of a stretch acts with the newest weights. So what is learned
+depends on how the steps are divided into stretches, for instance on `eval_every`.
 
 If an environment fails, the training ends. What was learned and recorded until then is saved.
 """
