@@ -49,7 +49,7 @@ def q_value(
     """Q(s, a). The first layer is split, so that one product W_s s serves Q(s, a) and Q(s, ã)."""
     first, size = critic.layers[0], belief.shape[-1]
     projected = belief @ first.weight[:, :size].T
-    return jax.vmap(lambda s, a: critic.rest(s + first.weight[:, size:] @ a + first.bias)[0])(projected, action)
+    return jax.vmap(lambda s, a: critic.rest(s + a @ first.weight[:, size:].T + first.bias)[0])(projected, action)
 
 
 def least(
