@@ -284,7 +284,7 @@ class VRMAgent(SACAgent):
         if state.first is not None:
             stored = self.store_first_impression
             parts.insert(0, windows.note[0] if stored else states(state.first, windows, of_first).d)
-        belief = jnp.concatenate(parts, axis=-1)[self.burn_in :]
+        belief = jnp.concatenate([part[self.burn_in :] for part in parts], axis=-1)
         return split_updates(self.transitions(windows, belief), self.batch_size)
 
     def update(self, state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
