@@ -4,7 +4,7 @@ Both run the paper's settings at the sizes of velocities-only Hopper (6 observat
 acts once, updates the controller once and, every fifth step, the keep-learning model. The authors draw these updates
 at random in that proportion; here every fifth step is one. Simulation, evaluation and pre-training are left out.
 
-"With options" is `vrm --burn-in 16 --store-state --precision bfloat16`, which computes less and less exactly.
+"With options" is `vrm --burn-in 16 --store-state --precision bfloat16`, which computes less, and rounds.
 
     git clone https://github.com/oist-cnru/Variational-Recurrent-Models /tmp/authors
     python -m venv /tmp/torch && /tmp/torch/bin/pip install torch==2.13.0 numpy
@@ -19,11 +19,11 @@ import time
 OBS, ACTIONS, INTERVAL = 6, 3, 5
 EPISODES, LENGTH = 20, 100  # in the replay
 ROUNDS, OURS, THEIRS = 5, 300, 50  # steps timed in each round
-OPTIONS = {"burn_in": 16, "store_state": True}
+OURS_WITH = {"vrm": {}, "with options": {"precision": "bfloat16", "burn_in": 16, "store_state": True}}
 
 
-def ours(precision: str = "float32", **options) -> float:
-    """Milliseconds per step of beliefrl's vrm with these hyperparameters."""
+def ours(precision: str = "float32", **hyperparameters) -> float:
+    """Milliseconds per step of beliefrl's vrm with these settings."""
     import jax
 
     from beliefrl import agents
@@ -32,7 +32,7 @@ def ours(precision: str = "float32", **options) -> float:
     from beliefrl.training.rounds import stretch_length
 
     jax.config.update("jax_default_matmul_precision", precision)
-    agent = agents.make("vrm", **options)
+    agent = agents.make("vrm", **hyperparameters)
     program = phases.compile_program(agent, Noise(OBS, ACTIONS), capacity=EPISODES * LENGTH, episodes=1)
     seeds, stretch = program.begin(jax.random.split(jax.random.key(0), 1)), stretch_length(agent)
     explored = EPISODES * LENGTH
@@ -84,7 +84,7 @@ def theirs(checkout: str) -> float:
 
 def main(checkout: str, python: str) -> None:
     """Time all `ROUNDS` times in turn, each in a process of its own; print medians and median ratios."""
-    commands = {"vrm": sys.executable, "with options": sys.executable, "authors": python}
+    commands = dict.fromkeys(OURS_WITH, sys.executable) | {"authors": python}
     times: dict[str, list[float]] = {who: [] for who in commands}
     for number in range(ROUNDS):
         for who, interpreter in commands.items():
@@ -92,21 +92,15 @@ def main(checkout: str, python: str) -> None:
             output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
             times[who].append(float(output.split()[-1]))
         print(f"round {number + 1}: " + ", ".join(f"{who} {each[-1]:.1f}" for who, each in times.items()), "ms a step")
-    for who in ("vrm", "with options"):
+    for who in OURS_WITH:
         ratios = [theirs / mine for mine, theirs in zip(times[who], times["authors"], strict=True)]
         print(f"{who}: median {statistics.median(times[who]):.1f} ms, median ratio {statistics.median(ratios):.1f}")
 
 
-def run(who: str, checkout: str) -> float:
-    """Milliseconds per step of one of the three."""
-    if who == "authors":
-        return theirs(checkout)
-    return ours("bfloat16", **OPTIONS) if who == "with options" else ours()
-
-
 if __name__ == "__main__":
     if len(sys.argv) == 4 and sys.argv[1] == "--run":
-        print(run(*sys.argv[2:]))
+        who, checkout = sys.argv[2:]
+        print(theirs(checkout) if who == "authors" else ours(**OURS_WITH[who]))
     elif len(sys.argv) == 3:
         main(*sys.argv[1:])
     else:

@@ -41,7 +41,7 @@ class Linear(eqx.Module):
         self.bias = jnp.full((outputs,), inputs**-0.5)
 
     def __call__(self, x: Float[Array, " input"]) -> Float[Array, " output"]:
-        # In this order the product of a batch is (batch, output). XLA transposes the result of W x, which takes longer.
+        # W x of a batch is (output, batch), and XLA would copy it to (batch, output). With x @ W.T it would copy W.
         return jax.lax.dot_general(x, self.weight, (((0,), (1,)), ((), ()))) + self.bias
 
 

@@ -95,9 +95,8 @@ def _weight_gradient(
 ) -> Float[Array, "..."]:
     """The gradient of a weight, given the gradient of its products."""
     is_bias = weight.ndim == 1
-    if is_bias:
-        return jnp.sum(grad, (0, 1))
-    return jax.lax.dot_general(inputs, grad, (((0, 1), (0, 1)), ((), ())))
+    # Not einsum: it sums over (batch, time) and not (time, batch), for which XLA copies the arrays.
+    return jnp.sum(grad, (0, 1)) if is_bias else jnp.tensordot(inputs, grad, ((0, 1), (0, 1)))
 
 
 unroll.defvjp(_unroll_forward, _unroll_backward)
