@@ -1,3 +1,4 @@
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +13,7 @@ from beliefrl.models.nets import (
     gaussian_kl,
     gaussian_log_prob,
     initial_statistics,
+    layer_norm,
     lstm_step,
     lstm_step_backward,
     standardise,
@@ -93,6 +95,19 @@ def test_joint_layers_start_in_the_bounds_of_their_parts():
 def test_rest_continues_from_the_first_layer():
     mlp, x = draw(jax.random.key(0), MLP((3, 8, 8, 2), jnp.tanh)), jnp.arange(3.0)
     np.testing.assert_array_equal(mlp(x), mlp.rest(mlp.layers[0](x)))
+
+
+def test_layer_norm_removes_the_mean_and_the_scale_of_a_layer():
+    x = np.array([1.0, 5.0, 3.0, -2.0], np.float32)
+    np.testing.assert_allclose(layer_norm(jnp.asarray(x)), (x - x.mean()) / np.sqrt(x.var() + 1e-5), rtol=1e-5)
+    mlp, given = draw(jax.random.key(0), MLP((3, 8, 8, 2), jnp.tanh, normalise=True)), jnp.array([9.0, -4.0, 2.0])
+    for layer, factor in ((0, 1), (1, 1), (2, 2)):  # the last layer is not normalised
+        doubled = eqx.tree_at(lambda mlp, n=layer: mlp.layers[n], mlp, replace_fn=double)
+        np.testing.assert_allclose(doubled(given), factor * mlp(given), rtol=1e-3)
+
+
+def double(tree):
+    return jax.tree.map(lambda leaf: 2 * leaf, tree)
 
 
 def test_a_scale_has_the_moments_of_all_valid_vectors_and_makes_them_standard():

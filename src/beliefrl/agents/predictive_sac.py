@@ -84,7 +84,9 @@ class PredictiveSACAgent(ControllerAgent):
     """ω, in [0, 1]: at an action that the present policy would not choose, the trace is ωλ. With 1, it is λ everywhere,
     whichever policy chose the action."""
     train_interval_rl: int = 1
-    """Environment steps between two updates of the model. The controller makes one update for each step."""
+    """Environment steps between two updates of the model."""
+    updates_per_step: int = 2
+    """Updates of the controller for each environment step."""
     batch_size: int = 128
     """Transitions in an update of the controller."""
     lr_actor: float = 1e-3
@@ -101,6 +103,8 @@ class PredictiveSACAgent(ControllerAgent):
     """Hidden layers of the actor."""
     value_layers: tuple[int, ...] = (128, 128)
     """Hidden layers of each Q."""
+    normalise_critics: bool = True
+    """Layer normalisation, without gains, before each activation of the Q networks (Ba et al. 2016)."""
     actor_regulariser: float = 1e-3
     """Weight of half the mean square of the policy's μ in the actor's loss."""
 
@@ -134,6 +138,7 @@ class PredictiveSACAgent(ControllerAgent):
     rate is at least 10 / (n + 9). With 1, the newest weights are evaluated."""
 
     ranges = ControllerAgent.ranges | {
+        "updates_per_step": (1, 2, 4),
         "batch_size": (64, 128, 256, 512),
         "trace_decay": Range(0.8, 1.0),
         "tau": Range(5e-3, 5e-2, "log"),
@@ -144,10 +149,12 @@ class PredictiveSACAgent(ControllerAgent):
         "pool": (4, 8, 16),
     }
 
+    unrecorded = {"normalise_critics": False, "updates_per_step": 1}
+
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
         super().__post_init__()
-        check_range(self, ("batch_size", "seq_len", "sequences", "pool", "longest_memory"), 1)
+        check_range(self, ("updates_per_step", "batch_size", "seq_len", "sequences", "pool", "longest_memory"), 1)
         check_range(self, ("d_size", "hidden_size"), 1, WIDEST)
         check_range(self, ("pretrain_updates",), 0)
         check_range(self, ("alpha_start",), 1e-6)
@@ -182,7 +189,7 @@ class PredictiveSACAgent(ControllerAgent):
         sizes = spec.obs_dim, spec.action_dim, len(self.reward_memory)
         model = init_model(key_model, *sizes, self.d_size, self.hidden_size, self.long_memories, self.longest_memory)
         belief = self.d_size + spec.obs_dim + spec.action_dim + 1
-        layers = self.policy_layers, self.value_layers
+        layers = self.policy_layers, self.value_layers, self.normalise_critics
         controller = double_q.init_controller(key_controller, belief, spec.action_dim, *layers, self.alpha_start)
         return State(
             model,
@@ -268,7 +275,7 @@ class PredictiveSACAgent(ControllerAgent):
         state, belief, metrics = self.learn_model(state, windows)
         samples, likeness = self.samples(state, windows, belief, key_targets)
         found = pool.add(state.pool, samples)
-        batches = pool.draw(found, key_draw, (self.cycle, self.batch_size))
+        batches = pool.draw(found, key_draw, (self.cycle * self.updates_per_step, self.batch_size))
         batches = batches._replace(belief=standardise(state.scales.belief, batches.belief))
         return state._replace(pool=found), batches, metrics | {"likeness": likeness}
 
@@ -284,15 +291,8 @@ class PredictiveSACAgent(ControllerAgent):
         return samples, valid_mean(likeness.ravel(), valid.ravel())
 
     def update(self, state: State, batch: Samples, key: Key[Array, ""]) -> tuple[State, Metrics]:
-        controller, optimiser, metrics = double_q.update(
-            self.optimisers,
-            state.controller_optimiser,
-            state.controller,
-            batch,
-            key,
-            self.tau,
-            self.actor_regulariser,
-            self.target_entropy,
-        )
+        given = state.controller_optimiser, state.controller, batch, key
+        settings = self.tau, self.actor_regulariser, self.target_entropy
+        controller, optimiser, metrics = double_q.update(self.optimisers, *given, *settings)
         followed = average.follow(state.average, (state.model, controller.actor), self.average_rate)
         return state._replace(controller=controller, controller_optimiser=optimiser, average=followed), metrics

@@ -115,10 +115,11 @@ def init_controller(
     action: int,
     policy_layers: tuple[int, ...],
     value_layers: tuple[int, ...],
+    normalise_critics: bool,
     alpha: float,
 ) -> DoubleQController:
     """A new controller for beliefs and actions of these sizes; Q̄ starts as Q, α at `alpha`, u at 1."""
-    critic = MLP((belief + action, *value_layers, 1), jax.nn.relu)
+    critic = MLP((belief + action, *value_layers, 1), jax.nn.relu, normalise_critics)
     actor, critics = draw(key, (OneTrunkActor(belief, action, policy_layers), (critic, critic)))
     unit = Unit(jnp.ones(()), jnp.zeros(()))
     return DoubleQController(actor, critics, jax.tree.map(jnp.copy, critics), jnp.full((), math.log(alpha)), unit)
