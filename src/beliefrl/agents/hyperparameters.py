@@ -74,14 +74,13 @@ def of(agent: Any) -> dict[str, Any]:
 def restored(agent: Any, recorded: Mapping[str, Any]) -> Any:
     """An agent like this one, or of this class, with hyperparameters that were recorded as JSON.
 
-    JSON cannot represent some values, such as functions. For these the agent keeps its own values. The class attribute
-    `unrecorded` of an agent has the values of hyperparameters that older versions did not have, and did not record.
+    JSON cannot represent some values, such as functions. For these the agent keeps its own values.
 
     Raises:
         UserError: as `build`.
     """
     like: Any = build(agent, {}) if isinstance(agent, type) and not _required(agent) else agent
-    values = dict(getattr(like, "unrecorded", {}))
+    values = {}
     for name, value in tuples(recorded).items():
         own = getattr(like, name, None)
         if dataclasses.is_dataclass(own) and isinstance(value, dict):

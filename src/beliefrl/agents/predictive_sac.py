@@ -85,8 +85,8 @@ class PredictiveSACAgent(ControllerAgent):
     whichever policy chose the action."""
     train_interval_rl: int = 1
     """Environment steps between two updates of the model."""
-    updates_per_step: int = 2
-    """Updates of the controller for each environment step."""
+    updates_per_step: int = 1
+    """Updates of the controller for each environment step. With more, a step takes longer."""
     batch_size: int = 128
     """Transitions in an update of the controller."""
     lr_actor: float = 1e-3
@@ -103,7 +103,7 @@ class PredictiveSACAgent(ControllerAgent):
     """Hidden layers of the actor."""
     value_layers: tuple[int, ...] = (128, 128)
     """Hidden layers of each Q."""
-    normalise_critics: bool = True
+    normalise_critics: bool = False
     """Layer normalisation, without gains, before each activation of the Q networks (Ba et al. 2016)."""
     actor_regulariser: float = 1e-3
     """Weight of half the mean square of the policy's μ in the actor's loss."""
@@ -139,6 +139,7 @@ class PredictiveSACAgent(ControllerAgent):
 
     ranges = ControllerAgent.ranges | {
         "updates_per_step": (1, 2, 4),
+        "normalise_critics": (False, True),
         "batch_size": (64, 128, 256, 512),
         "trace_decay": Range(0.8, 1.0),
         "tau": Range(5e-3, 5e-2, "log"),
@@ -148,8 +149,6 @@ class PredictiveSACAgent(ControllerAgent):
         "long_memories": Range(0.0, 0.5),
         "pool": (4, 8, 16),
     }
-
-    unrecorded = {"normalise_critics": False, "updates_per_step": 1}
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
