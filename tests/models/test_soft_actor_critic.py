@@ -173,8 +173,9 @@ COUNT = 12
 KEY = jax.random.key(0)
 
 
-def make(key=KEY):
-    controller = jax.jit(lambda key: double_q.init_controller(key, BELIEF, ACTION, (8, 8), (8, 8), 0.1))(key)
+def make(key=KEY, normalise=False):
+    sizes = BELIEF, ACTION, (8, 8), (8, 8)
+    controller = jax.jit(lambda key: double_q.init_controller(key, *sizes, 0.1, normalise))(key)
     return controller._replace(unit=Unit(jnp.array(9.0), jnp.array(4.0)))
 
 
@@ -268,8 +269,9 @@ def test_the_losses_are_their_formulas_over_valid_transitions():
     np.testing.assert_allclose(j_pi, np.mean(expected[valid]), rtol=1e-4)
 
 
-def test_a_new_unit_leaves_every_q_as_it_is():
-    controller, data = make(), random_batch()
+@pytest.mark.parametrize("normalise", [False, True])
+def test_a_new_unit_leaves_every_q_as_it_is(normalise):
+    controller, data = make(normalise=normalise), random_batch()
     after = jax.jit(double_q.rescale)(controller, 100 * data.target, data.valid)
     assert after.unit.u > 2 * controller.unit.u
     for old, new in zip((*controller.critics, *controller.targets), (*after.critics, *after.targets), strict=True):

@@ -188,8 +188,8 @@ class PredictiveSACAgent(ControllerAgent):
         sizes = spec.obs_dim, spec.action_dim, len(self.reward_memory)
         model = init_model(key_model, *sizes, self.d_size, self.hidden_size, self.long_memories, self.longest_memory)
         belief = self.d_size + spec.obs_dim + spec.action_dim + 1
-        layers = self.policy_layers, self.value_layers, self.normalise_critics
-        controller = double_q.init_controller(key_controller, belief, spec.action_dim, *layers, self.alpha_start)
+        settings = self.policy_layers, self.value_layers, self.alpha_start, self.normalise_critics
+        controller = double_q.init_controller(key_controller, belief, spec.action_dim, *settings)
         return State(
             model,
             controller,

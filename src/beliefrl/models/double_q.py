@@ -115,8 +115,8 @@ def init_controller(
     action: int,
     policy_layers: tuple[int, ...],
     value_layers: tuple[int, ...],
-    normalise_critics: bool,
     alpha: float,
+    normalise_critics: bool = False,
 ) -> DoubleQController:
     """A new controller for beliefs and actions of these sizes; Q̄ starts as Q, α at `alpha`, u at 1."""
     critic = MLP((belief + action, *value_layers, 1), jax.nn.relu, normalise_critics)
