@@ -13,7 +13,6 @@ from beliefrl.models.nets import (
     gaussian_kl,
     gaussian_log_prob,
     initial_statistics,
-    layer_norm,
     lstm_step,
     lstm_step_backward,
     standardise,
@@ -98,8 +97,10 @@ def test_rest_continues_from_the_first_layer():
 
 
 def test_layer_norm_removes_the_mean_and_the_scale_of_a_layer():
-    x = np.array([1.0, 5.0, 3.0, -2.0], np.float32)
-    np.testing.assert_allclose(layer_norm(jnp.asarray(x)), (x - x.mean()) / np.sqrt(x.var() + 1e-5), rtol=1e-5)
+    one = draw(jax.random.key(1), MLP((3, 8, 2), jnp.tanh, normalise=True))
+    x = np.asarray(one.layers[0](jnp.arange(3.0)))
+    wanted = one.layers[1](jnp.tanh((x - x.mean()) / np.sqrt(x.var() + 1e-5)))
+    np.testing.assert_allclose(one(jnp.arange(3.0)), wanted, rtol=1e-5)
     mlp, given = draw(jax.random.key(0), MLP((3, 8, 8, 2), jnp.tanh, normalise=True)), jnp.array([9.0, -4.0, 2.0])
     for layer, factor in ((0, 1), (1, 1), (2, 2)):  # the last layer is not normalised
         doubled = eqx.tree_at(lambda mlp, n=layer: mlp.layers[n], mlp, replace_fn=double)

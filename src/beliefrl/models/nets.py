@@ -26,7 +26,6 @@ LOG_2PI = 1.8378770664093453
 # tests/models/golden.npz (|u| up to 2.8) loss_actor differs from the authors' by 4.3e-5 and the actor's gradient by
 # 5.7e-5.
 TANH_EPSILON = 1e-6
-LAYER_NORM_EPSILON = 1e-5
 
 Params = TypeVar("Params")
 
@@ -54,7 +53,10 @@ class MLP(eqx.Module):
     normalise: bool = eqx.field(static=True)
 
     def __init__(self, sizes: Sequence[int], activation: Callable[[Array], Array], normalise: bool = False):
-        """`sizes` are the widths from input to output, at least two. `normalise`: `layer_norm` before activations."""
+        """`sizes` are the widths from input to output, at least two.
+
+        With `normalise`, there is layer normalisation without gains before each activation (Ba et al. 2016).
+        """
         self.layers = tuple(Linear(m, n) for m, n in itertools.pairwise(sizes))
         self.activation = activation
         self.normalise = normalise
@@ -65,14 +67,10 @@ class MLP(eqx.Module):
     def rest(self, first: Float[Array, " hidden"]) -> Float[Array, " output"]:
         """The network's output, given the output of its first layer, for callers that compute the first product."""
         for layer in self.layers[1:]:
-            first = layer(self.activation(layer_norm(first) if self.normalise else first))
+            if self.normalise:
+                first = eqx.nn.LayerNorm(first.shape, use_weight=False, use_bias=False)(first)
+            first = layer(self.activation(first))
         return first
-
-
-def layer_norm(x: Float[Array, " hidden"]) -> Float[Array, " hidden"]:
-    """x with mean 0 and variance 1 over its entries: layer normalisation without gains (Ba et al. 2016)."""
-    x = x - jnp.mean(x)
-    return x * jax.lax.rsqrt(jnp.mean(x**2) + LAYER_NORM_EPSILON)
 
 
 def draw(key: Key[Array, ""], bounds: Params) -> Params:
