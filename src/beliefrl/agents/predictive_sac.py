@@ -28,7 +28,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from beliefrl.agents.base import ControllerAgent, Metrics, Range
 from beliefrl.models import average, double_q, pool, reading
@@ -103,7 +103,7 @@ class PredictiveSACAgent(ControllerAgent):
     """Hidden layers of the actor."""
     value_layers: tuple[int, ...] = (128, 128)
     """Hidden layers of each Q."""
-    normalise_critics: bool = False
+    normalise_critics: bool = True
     """Layer normalisation, without gains, before each activation of the Q networks (Ba et al. 2016)."""
     actor_regulariser: float = 1e-3
     """Weight of half the mean square of the policy's μ in the actor's loss."""
@@ -112,7 +112,12 @@ class PredictiveSACAgent(ControllerAgent):
     pretrain_updates: int = 1000
     """Updates of the model alone at step_start_rl."""
     lr_model: float = 1e-3
-    """Adam's learning rate for the model."""
+    """Adam's learning rate for the model in its first `lr_model_updates` updates. After n updates it is
+    lr_model · lr_model_updates / n."""
+    lr_model_updates: int = 2000
+    """Updates of the model, pre-training included, before its learning rate falls."""
+    lr_model_min: float = 1e-5
+    """The learning rate of the model does not fall below this."""
     seq_len: int = 32
     """Steps in a window, and of the gradient through time."""
     sequences: int = 8
@@ -181,7 +186,10 @@ class PredictiveSACAgent(ControllerAgent):
 
     @property
     def model_optimiser(self) -> optax.GradientTransformation:
-        return optax.adam(self.lr_model)
+        def rate(n: Int[Array, ""]) -> Float[Array, ""]:
+            return jnp.maximum(self.lr_model * self.lr_model_updates / jnp.maximum(n, self.lr_model_updates), self.lr_model_min)
+
+        return optax.adam(rate)
 
     def init(self, key: Key[Array, ""], spec: Spec) -> State:
         key_model, key_controller = jax.random.split(key)
