@@ -268,11 +268,30 @@ def test_a_cycle_has_the_updates_of_its_steps(begun, steps):
 
 
 def test_only_the_critics_are_normalised():
-    agent = dataclasses.replace(AGENT, normalise_critics=True)
-    controller = agent.init(jax.random.key(0), SPEC).controller
+    controller = AGENT.init(jax.random.key(0), SPEC).controller
     assert [each.normalise for each in (*controller.critics, *controller.targets)] == [True] * 4
     assert not controller.actor.network.normalise
-    assert not AGENT.init(jax.random.key(0), SPEC).controller.critics[0].normalise
+    agent = dataclasses.replace(AGENT, normalise_critics=False)
+    assert not agent.init(jax.random.key(0), SPEC).controller.critics[0].normalise
+
+
+@pytest.mark.parametrize(
+    ("settings", "rates"),
+    [
+        ({}, [0.8, 0.8, 0.8, 0.8 * 2 / 3, 0.8 * 2 / 4, 0.8 * 2 / 5]),
+        ({"lr_model_min": 0.5}, [0.8, 0.8, 0.8, 0.8 * 2 / 3, 0.5, 0.5]),
+        ({"lr_model_min": 0.9}, [0.8] * 6),
+    ],
+)
+def test_the_learning_rate_of_the_model_falls(settings, rates):
+    """With a constant gradient, a step of Adam is as long as its learning rate."""
+    agent = dataclasses.replace(AGENT, lr_model=0.8, lr_model_updates=2, **settings)
+    optimiser, gradient, steps = agent.model_optimiser, jnp.ones(()), []
+    state = optimiser.init(gradient)
+    for _ in rates:
+        step, state = optimiser.update(gradient, state)
+        steps.append(-float(step))
+    np.testing.assert_allclose(steps, rates, rtol=1e-4)
 
 
 def test_the_controller_sends_no_gradient_into_the_model(state, begun):

@@ -19,7 +19,8 @@ windows of one cycle are too few and too correlated for a batch. There are as ma
 
 In training the newest weights act. Evaluations and the trained agent use an average of the last weights of the model
 and of the actor (`models.average`). The policy of the newest weights can change within few updates. The average changes
-slowly.
+slowly. The learning rate of the model falls, because averages of a model and an actor fit together only if the beliefs
+change slowly.
 """
 
 import dataclasses
@@ -112,12 +113,11 @@ class PredictiveSACAgent(ControllerAgent):
     pretrain_updates: int = 1000
     """Updates of the model alone at step_start_rl."""
     lr_model: float = 1e-3
-    """Adam's learning rate for the model in its first `lr_model_updates` updates. After n updates it is
-    lr_model · lr_model_updates / n."""
+    """Adam's learning rate for the model at first."""
     lr_model_updates: int = 2000
-    """Updates of the model, pre-training included, before its learning rate falls."""
+    """Updates of the model, with those of the pre-training, after which its learning rate falls as 1 / updates."""
     lr_model_min: float = 1e-5
-    """The learning rate of the model does not fall below this."""
+    """The learning rate of the model does not fall below this. With `lr_model` or more, it does not fall at all."""
     seq_len: int = 32
     """Steps in a window, and of the gradient through time."""
     sequences: int = 8
@@ -149,6 +149,7 @@ class PredictiveSACAgent(ControllerAgent):
         "trace_decay": Range(0.8, 1.0),
         "tau": Range(5e-3, 5e-2, "log"),
         "lr_model": Range(1e-4, 3e-3, "log"),
+        "lr_model_updates": (1000, 2000, 5000, 20000),
         "seq_len": (16, 32, 64),
         "d_size": (64, 128, 256),
         "long_memories": Range(0.0, 0.5),
@@ -158,13 +159,15 @@ class PredictiveSACAgent(ControllerAgent):
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
         super().__post_init__()
-        check_range(self, ("updates_per_step", "batch_size", "seq_len", "sequences", "pool", "longest_memory"), 1)
+        check_range(self, ("updates_per_step", "batch_size", "lr_model_updates", "seq_len", "sequences", "pool"), 1)
         check_range(self, ("d_size", "hidden_size"), 1, WIDEST)
         check_range(self, ("pretrain_updates",), 0)
         check_range(self, ("alpha_start",), 1e-6)
-        check_range(self, ("lr_model", "jump", "long_memories", "trace_decay", "off_policy_trace"), 0, 1)
+        check_range(
+            self, ("lr_model", "lr_model_min", "jump", "long_memories", "trace_decay", "off_policy_trace"), 0, 1
+        )
         check_range(self, ("average_rate",), 1e-6, 1)
-        check_range(self, ("reward_memory",), 1)
+        check_range(self, ("reward_memory", "longest_memory"), 1)
 
     # How it is trained
 
@@ -186,8 +189,9 @@ class PredictiveSACAgent(ControllerAgent):
 
     @property
     def model_optimiser(self) -> optax.GradientTransformation:
-        def rate(n: Int[Array, ""]) -> Float[Array, ""]:
-            return jnp.maximum(self.lr_model * self.lr_model_updates / jnp.maximum(n, self.lr_model_updates), self.lr_model_min)
+        def rate(updates: Int[Array, ""]) -> Float[Array, ""]:
+            falling = self.lr_model * self.lr_model_updates / jnp.maximum(updates, self.lr_model_updates)
+            return jnp.maximum(falling, min(self.lr_model, self.lr_model_min))
 
         return optax.adam(rate)
 
