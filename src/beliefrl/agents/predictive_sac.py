@@ -114,7 +114,7 @@ class PredictiveSACAgent(ControllerAgent):
     """Updates of the model alone at step_start_rl."""
     lr_model: float = 1e-3
     """Adam's learning rate for the model at first."""
-    lr_model_updates: int = 2000
+    lr_model_updates: int = 6000
     """Updates of the model, with those of the pre-training, after which its learning rate falls as 1 / updates."""
     lr_model_min: float = 1e-5
     """The learning rate of the model does not fall below this. With `lr_model` or more, it does not fall at all."""
@@ -149,7 +149,7 @@ class PredictiveSACAgent(ControllerAgent):
         "trace_decay": Range(0.8, 1.0),
         "tau": Range(5e-3, 5e-2, "log"),
         "lr_model": Range(1e-4, 3e-3, "log"),
-        "lr_model_updates": (1000, 2000, 5000, 20000),
+        "lr_model_updates": (2000, 6000, 20000),
         "seq_len": (16, 32, 64),
         "d_size": (64, 128, 256),
         "long_memories": Range(0.0, 0.5),
