@@ -157,6 +157,7 @@ def test_pretraining_learns_which_rewards_are_usual_and_what_follows_does_not_ch
     np.testing.assert_allclose(trained.scales.usual.excess(jnp.array(-3.2)), -4.2, rtol=1e-6)
     later, _, _ = jax.jit(AGENT.begin_cycle)(trained, window, jax.random.key(3))
     assert same(later.scales.usual, trained.scales.usual)
+    assert later.model_optimiser[1].count == 2  # the updates after which the learning rate falls include these
 
 
 def test_the_targets_have_the_discount_of_the_agent(begun):
@@ -365,6 +366,8 @@ def test_what_does_not_exist_changes_nothing(state):
         ("off_policy_trace", -0.1),
         ("alpha_start", -1.0),
         ("average_rate", 0.0),
+        ("lr_model_updates", 0),
+        ("lr_model_min", -0.1),
     ],
 )
 def test_impossible_values_are_refused(field, value):

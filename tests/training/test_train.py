@@ -249,6 +249,19 @@ def test_other_sizes_are_one_sentence_and_no_folder(source, tmp_path, agent, tas
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize("recorded", [{"normalise_critics": False}, {}])  # the second is from before the option
+def test_other_layers_are_one_sentence_and_no_folder(tmp_path, recorded):
+    source = saved(tmp_path / "source", "predictive-sac", TASK)
+    config = json.loads((source.folder / "config.json").read_text())
+    assert config["hyperparameters"].pop("normalise_critics")
+    config["hyperparameters"] |= recorded
+    (source.folder / "config.json").write_text(json.dumps(config))
+    initial.taken(Options(init_from=str(source.folder)), tiny("predictive-sac", normalise_critics=False), TASK.spec)
+    with pytest.raises(UserError, match="normalise_critics=False, this training has True; set normalise_critics=F"):
+        train(tiny("predictive-sac"), TASK, tmp_path / "run", init_from=source)
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.slow
 def test_a_training_starts_there_without_pretraining_and_needs_the_other_run_no_more(source, tmp_path):
     networks = arrays.load(source.agents())

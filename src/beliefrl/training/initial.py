@@ -26,9 +26,11 @@ def taken(options: Options, agent: Agent, spec: Spec) -> tuple[dict[str, np.ndar
     Seed n starts from seed n of the other run. If the other run has fewer seeds, its seeds are reused in a cycle.
 
     Raises:
-        UserError: there is no such run, it has no trained agent, or the agents differ in an array.
+        UserError: there is no such run, it has no trained agent, or the agents differ in an array or in whether
+            layers are normalised.
     """
     source = Run(options.init_from or "")
+    _refuse_other_layers(source, agent)
     path = source.agents(options.init_best)
     saved = _fitting(source, arrays.load(path), agent, spec)
     first, count = source.seeds[0], len(source.seeds)
@@ -69,6 +71,17 @@ def _last_evaluations(source: Run) -> list[dict[str, Any] | None]:
     """{"step"} of the last evaluation of each seed."""
     steps = [max((row["step"] for row in source.rows(seed, "evaluation")), default=None) for seed in source.seeds]
     return [None if step is None else {"step": step} for step in steps]
+
+
+def _refuse_other_layers(source: Run, agent: Agent) -> None:
+    """Layer normalisation has no arrays of its own, so `_fitting` cannot see it. Runs from before it have no entry."""
+    here = getattr(agent, "normalise_critics", False)
+    there = source.config["hyperparameters"].get("normalise_critics", False)
+    if there != here:
+        raise UserError(
+            f"{source.folder} cannot be init_from: it has normalise_critics={there}, this training has {here}; set "
+            f"normalise_critics={there}."
+        )
 
 
 def _fitting(source: Run, saved: dict[str, np.ndarray], agent: Agent, spec: Spec) -> dict[str, np.ndarray]:
