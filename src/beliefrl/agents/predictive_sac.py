@@ -29,7 +29,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, Int, Key
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents.base import ControllerAgent, Metrics, Range
 from beliefrl.models import average, double_q, pool, reading
@@ -189,7 +190,7 @@ class PredictiveSACAgent(ControllerAgent):
 
     @property
     def model_optimiser(self) -> optax.GradientTransformation:
-        def rate(updates: Int[Array, ""]) -> Float[Array, ""]:
+        def rate(updates: ArrayLike) -> Float[Array, ""]:
             falling = self.lr_model * self.lr_model_updates / jnp.maximum(updates, self.lr_model_updates)
             return jnp.maximum(falling, min(self.lr_model, self.lr_model_min))
 
