@@ -29,14 +29,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents.base import ControllerAgent, Metrics, Range
 from beliefrl.models import average, double_q, pool, reading
 from beliefrl.models.average import Average
 from beliefrl.models.double_q import DoubleQController, Policy, Samples
-from beliefrl.models.nets import LSTMState, descend, standardise, update_statistics
+from beliefrl.models.nets import LSTMState, descend, falling_rate, standardise, update_statistics
 from beliefrl.models.pool import Pool
 from beliefrl.models.predictive_model import PredictiveModel, init_model, prediction_loss, remember
 from beliefrl.models.scales import Scales, initial_scales
@@ -114,11 +113,11 @@ class PredictiveSACAgent(ControllerAgent):
     pretrain_updates: int = 1000
     """Updates of the model alone at step_start_rl."""
     lr_model: float = 1e-3
-    """Adam's learning rate for the model at first."""
+    """Adam's learning rate for the model in its first `lr_model_updates` updates."""
     lr_model_updates: int = 6000
-    """Updates of the model, with those of the pre-training, after which its learning rate falls as 1 / updates."""
+    """Number of updates of the model, including the pre-training, from which on its learning rate falls as 1 / n."""
     lr_model_min: float = 1e-5
-    """The learning rate of the model does not fall below this. With `lr_model` or more, it does not fall at all."""
+    """Smallest learning rate of the model. If it is `lr_model` or more, the learning rate is constant."""
     seq_len: int = 32
     """Steps in a window, and of the gradient through time."""
     sequences: int = 8
@@ -164,9 +163,8 @@ class PredictiveSACAgent(ControllerAgent):
         check_range(self, ("d_size", "hidden_size"), 1, WIDEST)
         check_range(self, ("pretrain_updates",), 0)
         check_range(self, ("alpha_start",), 1e-6)
-        check_range(
-            self, ("lr_model", "lr_model_min", "jump", "long_memories", "trace_decay", "off_policy_trace"), 0, 1
-        )
+        check_range(self, ("lr_model", "lr_model_min", "jump"), 0, 1)
+        check_range(self, ("long_memories", "trace_decay", "off_policy_trace"), 0, 1)
         check_range(self, ("average_rate",), 1e-6, 1)
         check_range(self, ("reward_memory", "longest_memory"), 1)
 
@@ -190,11 +188,7 @@ class PredictiveSACAgent(ControllerAgent):
 
     @property
     def model_optimiser(self) -> optax.GradientTransformation:
-        def rate(updates: ArrayLike) -> Float[Array, ""]:
-            falling = self.lr_model * self.lr_model_updates / jnp.maximum(updates, self.lr_model_updates)
-            return jnp.maximum(falling, min(self.lr_model, self.lr_model_min))
-
-        return optax.adam(rate)
+        return optax.adam(falling_rate(self.lr_model, self.lr_model_updates, self.lr_model_min))
 
     def init(self, key: Key[Array, ""], spec: Spec) -> State:
         key_model, key_controller = jax.random.split(key)
@@ -220,15 +214,9 @@ class PredictiveSACAgent(ControllerAgent):
         Before the first update there are no averages, and the newest weights stay.
         """
         model, actor = average.averaged(state.average, (state.model, state.controller.actor))
-        return state._replace(
-            model=model,
-            controller=state.controller._replace(actor=actor),
-            readers=(),
-            pool=(),
-            model_optimiser=(),
-            controller_optimiser=(),
-            average=(),
-        )
+        only_for_updates = ("readers", "pool", "model_optimiser", "controller_optimiser", "average")
+        controller = state.controller._replace(actor=actor)
+        return state._replace(model=model, controller=controller, **dict.fromkeys(only_for_updates, ()))
 
     # Acting
 

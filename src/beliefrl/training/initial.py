@@ -30,9 +30,9 @@ def taken(options: Options, agent: Agent, spec: Spec) -> tuple[dict[str, np.ndar
             layers are normalised.
     """
     source = Run(options.init_from or "")
-    _refuse_other_layers(source, agent)
     path = source.agents(options.init_best)
     saved = _fitting(source, arrays.load(path), agent, spec)
+    _refuse_other_layers(source, agent)
     first, count = source.seeds[0], len(source.seeds)
     seeds = range(options.seed, options.seed + options.seeds)
     index = [(seed - first) % count for seed in seeds]
@@ -79,8 +79,8 @@ def _refuse_other_layers(source: Run, agent: Agent) -> None:
     there = source.config["hyperparameters"].get("normalise_critics", False)
     if there != here:
         raise UserError(
-            f"{source.folder} cannot be init_from: it has normalise_critics={there}, this training has {here}; set "
-            f"normalise_critics={there}."
+            f"{source.folder} cannot be init_from: it was trained with normalise_critics={there}, and this training "
+            f"has {here}; set normalise_critics={there}."
         )
 
 
