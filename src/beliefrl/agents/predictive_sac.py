@@ -114,7 +114,7 @@ class PredictiveSACAgent(ControllerAgent):
     """Updates of the model alone at step_start_rl."""
     lr_model: float = 1e-3
     """Adam's learning rate for the model in its first `lr_model_updates` updates."""
-    lr_model_updates: int = 6000
+    lr_model_updates: int = 12000
     """Number of updates of the model, including the pre-training, from which on its learning rate falls as 1 / n."""
     lr_model_min: float = 1e-5
     """Smallest learning rate of the model. If it is `lr_model` or more, the learning rate is constant."""
@@ -149,7 +149,7 @@ class PredictiveSACAgent(ControllerAgent):
         "trace_decay": Range(0.8, 1.0),
         "tau": Range(5e-3, 5e-2, "log"),
         "lr_model": Range(1e-4, 3e-3, "log"),
-        "lr_model_updates": (2000, 6000, 20000),
+        "lr_model_updates": (6000, 12000, 24000),
         "seq_len": (16, 32, 64),
         "d_size": (64, 128, 256),
         "long_memories": Range(0.0, 0.5),
