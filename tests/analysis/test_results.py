@@ -26,11 +26,10 @@ def packed(path, *runs):
 
 def test_a_run_comes_back_with_its_settings_and_evaluations(tmp_path):
     seeds = [[(10, [1.0, 1 / 3], [True, False])], [(10, [-123.456789, 4.0], [False, False])]]
-    settings = {"gamma": 0.9, "layers": [256, 256]}
-    run = a_run(tmp_path / "run", seeds, settings=settings, first=3, **HOUR)
+    run = a_run(tmp_path / "run", seeds, settings=DEFAULTS["vrm"] | {"gamma": 0.9}, first=3, **HOUR)
     (kept,) = packed(tmp_path / "kept.json.gz", run)
     assert kept.folder.name == "run"
-    assert kept.config == {**run.config, "hyperparameters": DEFAULTS["vrm"] | settings}
+    assert kept.config == run.config
     for seed in (3, 4):
         (row,), (was,) = kept.rows(seed, "evaluation"), run.rows(seed, "evaluation")
         assert row.keys() == was.keys()
@@ -49,6 +48,16 @@ def test_a_later_default_does_not_change_what_a_file_says(tmp_path, monkeypatch)
     (run,) = groups.find([tmp_path / "kept.json.gz"]).runs
     (group,) = groups.groups([run], {"vrm": {**DEFAULTS["vrm"], "gamma": 0.5}})
     assert group.seeds[0][0].config["hyperparameters"]["gamma"] == 0.99
+
+
+def test_a_run_that_is_older_than_a_setting_gets_no_value_for_it_when_a_file_is_extended(tmp_path):
+    file = tmp_path / "kept.json.gz"
+    run = a_run(tmp_path / "run", [flat(1.0)], settings={"gamma": 0.9, "layers": [256, 256], "tau": 0.005})
+    kept = packed(file, run)
+    for value in (False, True):  # a later version has the setting, and a still later one another default
+        results.write(file, kept, {"vrm": {**DEFAULTS["vrm"], "normalise": value}})
+        kept = results.read(file)
+        assert kept[0].config["hyperparameters"] == run.config["hyperparameters"]
 
 
 def test_updates_are_kept_as_the_models_loss_between_evaluations(tmp_path):

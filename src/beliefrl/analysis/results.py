@@ -3,7 +3,9 @@
     {"format": 1, "defaults": {AGENT: {NAME: value}}, "runs": [{"name", "config", "rows": {SEED: [row]}}]}
 
 `config` is the run's config.json, but only with the hyperparameters that differ from the agent's `defaults` in the
-file. The rows are the evaluations, the divergences, and the means of `SERIES` over the updates between evaluations.
+file. A run that is older than some hyperparameters has their names under `lacks`: their values are not known, because a
+default may have changed since. The rows are the evaluations, the divergences, and the means of `SERIES` over the
+updates between evaluations.
 Numbers have six significant digits.
 """
 
@@ -65,7 +67,9 @@ def read(path: pathlib.Path) -> list[KeptRun]:
 
 def _unpacked(path: pathlib.Path, entry: dict[str, Any], defaults: Mapping[str, Row]) -> KeptRun:
     config = entry["config"]
-    config["hyperparameters"] = defaults.get(config["agent"], {}) | config["hyperparameters"]
+    known, lacks = defaults.get(config["agent"], {}), entry.get("lacks", ())
+    usual = {name: value for name, value in known.items() if name not in lacks}
+    config["hyperparameters"] = usual | config["hyperparameters"]
     run = KeptRun(path / entry["name"], config, {int(seed): rows for seed, rows in entry["rows"].items()})
     if not all("step" in row and "kind" in row for seed in run.seeds for row in run.rows(seed)):
         raise ValueError("a row lacks its step or kind")
@@ -115,9 +119,13 @@ def means_between(updates: Sequence[Row], name: str, steps: Sequence[int]) -> np
 
 
 def _packed(run: Run, usual: Row) -> dict[str, Any]:
-    text = json.dumps(run.config | {"hyperparameters": changed(usual | run.config["hyperparameters"], usual)})
+    own = run.config["hyperparameters"]
+    ordered = {name: own[name] for name in (usual | own) if name in own}
+    text = json.dumps(run.config | {"hyperparameters": changed(ordered, usual)})
     config = json.loads(re.sub(r'"/[^"]*/(runs/[^"]*)"', r'"\1"', text))  # cut absolute paths to runs/...
-    return {"name": run.folder.name, "config": config, "rows": {seed: _kept_rows(run, seed) for seed in run.seeds}}
+    lacks = [name for name in usual if name not in own]
+    entry = {"name": run.folder.name, "config": config, "rows": {seed: _kept_rows(run, seed) for seed in run.seeds}}
+    return entry | ({"lacks": lacks} if lacks else {})
 
 
 def _kept_rows(run: Run, seed: int) -> list[Row]:
