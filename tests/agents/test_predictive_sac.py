@@ -239,7 +239,7 @@ def test_traces_use_the_policy_noted_at_their_timestep(state, begun):
     after, _, _ = jax.jit(agent.begin_cycle)(state, window, key)
     belief = jax.jit(agent.learn_model)(state, window)[1]
     valid, key = jnp.ones((6, 2), bool), jax.random.split(key)[0]
-    given = standardise(after.scales.belief, belief), window.step, valid, policy, key, agent.gamma, 0.8, 0.0
+    given = standardise(after.scales.belief, belief), window.step, valid, policy, key, agent.gamma, 0.8, 0.0, 1.0
     y, _ = jax.jit(lambda: double_q.targets(state.controller, *given))()
     np.testing.assert_allclose(after.pool.transitions.target[0], y.ravel(), rtol=1e-4, atol=1e-5)
 

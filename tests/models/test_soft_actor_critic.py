@@ -214,7 +214,13 @@ def density(policy, action):
     return np.prod(np.exp(-0.5 * ((before - policy.mean) / sigma) ** 2) / sigma, axis=-1)
 
 
-def test_targets_mix_the_lesser_target_s_values_by_how_likely_the_actions_are():
+def lower(one, two, pessimism):
+    """The smaller value for a pessimism of 1, and the mean for 0."""
+    return pessimism * np.minimum(one, two) + (1 - pessimism) * (one + two) / 2
+
+
+@pytest.mark.parametrize("pessimism", [1.0, 0.25])
+def test_targets_mix_the_lower_target_s_values_by_how_likely_the_actions_are(pessimism):
     controller, key, time = make(), jax.random.key(3), 4
     keys = jax.random.split(jax.random.key(5), 5)
     belief = jax.random.normal(keys[0], (time, 2, BELIEF))
@@ -223,13 +229,13 @@ def test_targets_mix_the_lesser_target_s_values_by_how_likely_the_actions_are():
     step = Timestep(belief, jax.random.normal(keys[2], (time, 2)), action, first, terminated)
     behaviour = Policy(*(0.5 * jax.random.normal(key, (time, 2, ACTION)) for key in keys[3:]))
     valid = jnp.ones((time - 1, 2), bool)
-    made = jax.jit(lambda: double_q.targets(controller, belief, step, valid, behaviour, key, 0.9, 0.8, 0.25))
+    made = jax.jit(lambda: double_q.targets(controller, belief, step, valid, behaviour, key, 0.9, 0.8, 0.25, pessimism))
     y, like = map(np.asarray, made())
 
     flat = np.asarray(belief).reshape(-1, BELIEF)
     noise = np.asarray(jax.random.normal(key, (time * 2, ACTION)))
     sampled, _, _ = policy(controller.actor, flat, noise)
-    value = 3 * np.minimum(*(q(critic, flat, sampled) for critic in controller.targets)).reshape(time, 2)  # u = 3
+    value = 3 * lower(*(q(critic, flat, sampled) for critic in controller.targets), pessimism).reshape(time, 2)  # u = 3
     now = Policy(*np.split(dense(controller.actor.network, np.asarray(belief)), 2, axis=-1))
     ahead = value[-1]
     for t in reversed(range(time - 1)):
@@ -251,19 +257,20 @@ def test_an_action_at_the_bound_has_a_finite_likeness():
         np.testing.assert_allclose(double_q.likeness(policy, behaviour, action), expected, atol=1e-6)
 
 
-def test_the_losses_are_their_formulas_over_valid_transitions():
+@pytest.mark.parametrize("pessimism", [1.0, 0.25])
+def test_the_losses_are_their_formulas_over_valid_transitions(pessimism):
     controller, data, key = make(), random_batch(), jax.random.key(3)
     valid, u = np.asarray(data.valid), float(controller.unit.u)
     errors = [q(critic, data.belief, data.action) - np.asarray(data.target) / u for critic in controller.critics]
     expected = np.mean(sum(0.5 * error[valid] ** 2 for error in errors))
     np.testing.assert_allclose(double_q.q_loss(controller.critics, data, controller.unit.u), expected, rtol=1e-4)
 
-    j_pi, (least, log_prob) = jax.jit(double_q.actor_loss, static_argnums=4)(
-        controller.actor, controller, data, key, 0.2
+    j_pi, (low, log_prob) = jax.jit(double_q.actor_loss, static_argnums=(4, 5))(
+        controller.actor, controller, data, key, 0.2, pessimism
     )
     action, density, mean = policy(controller.actor, data.belief, np.asarray(jax.random.normal(key, (COUNT, ACTION))))
-    values = np.minimum(*(q(critic, data.belief, action) for critic in controller.critics))
-    np.testing.assert_allclose(least, values, rtol=1e-4, atol=1e-5)
+    values = lower(*(q(critic, data.belief, action) for critic in controller.critics), pessimism)
+    np.testing.assert_allclose(low, values, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(log_prob, density, rtol=1e-4, atol=1e-4)
     expected = 0.1 * density - values + 0.5 * 0.2 * np.mean(mean**2, axis=-1)
     np.testing.assert_allclose(j_pi, np.mean(expected[valid]), rtol=1e-4)
@@ -303,7 +310,7 @@ def test_what_is_learned_does_not_depend_on_the_size_of_rewards(size):
         state = init_optimisers(optimisers, controller)
         for number in range(5):
             key = jax.random.key(number)
-            controller, state, _ = double_q.update(optimisers, state, controller, data, key, 0.1, 1e-3)
+            controller, state, _ = double_q.update(optimisers, state, controller, data, key, 0.1, 1e-3, 1.0)
         return controller
 
     plain = make()._replace(unit=Unit(jnp.array(25.0), jnp.array(1e6)))
@@ -322,9 +329,9 @@ def test_an_update_moves_the_targets_by_tau_and_ignores_what_is_not_valid():
 
     @jax.jit
     def update(data):
-        return double_q.update(optimisers, init_optimisers(optimisers, controller), controller, data, KEY, 0.25, 1e-3)[
-            0
-        ]
+        return double_q.update(
+            optimisers, init_optimisers(optimisers, controller), controller, data, KEY, 0.25, 1e-3, 1.0
+        )[0]
 
     after, same = update(data), update(other)
     for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(same), strict=True):

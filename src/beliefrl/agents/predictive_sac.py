@@ -84,6 +84,8 @@ class PredictiveSACAgent(ControllerAgent):
     off_policy_trace: float = 0.5
     """ω, in [0, 1]: at an action that the present policy would not choose, the trace is ωλ. With 1, it is λ everywhere,
     whichever policy chose the action."""
+    pessimism: float = 1.0
+    """P, in [0, 1]. With 1, actor and targets use the smaller of the two Q. With 0, they use their mean."""
     train_interval_rl: int = 1
     """Environment steps between two updates of the model."""
     updates_per_step: int = 1
@@ -147,6 +149,7 @@ class PredictiveSACAgent(ControllerAgent):
         "normalise_critics": (False, True),
         "batch_size": (64, 128, 256, 512),
         "trace_decay": Range(0.8, 1.0),
+        "pessimism": Range(0.0, 1.0),
         "tau": Range(5e-3, 5e-2, "log"),
         "lr_model": Range(1e-4, 3e-3, "log"),
         "lr_model_updates": (6000, 12000, 24000),
@@ -164,7 +167,7 @@ class PredictiveSACAgent(ControllerAgent):
         check_range(self, ("pretrain_updates",), 0)
         check_range(self, ("alpha_start",), 1e-6)
         check_range(self, ("lr_model", "lr_model_min", "jump"), 0, 1)
-        check_range(self, ("long_memories", "trace_decay", "off_policy_trace"), 0, 1)
+        check_range(self, ("long_memories", "trace_decay", "off_policy_trace", "pessimism"), 0, 1)
         check_range(self, ("average_rate",), 1e-6, 1)
         check_range(self, ("reward_memory", "longest_memory"), 1)
 
@@ -285,14 +288,13 @@ class PredictiveSACAgent(ControllerAgent):
         """The transitions of windows with their targets; also the mean of min(1, π / b)."""
         valid, s = reading.known_transitions(windows), standardise(state.scales.belief, belief)
         step, b = windows.step, windows.note.policy
-        discounts = self.gamma, self.trace_decay, self.off_policy_trace
-        y, likeness = double_q.targets(state.controller, s, step, valid, b, key, *discounts)
-        samples = Samples(belief[:-1], step.prev_action[1:], y, valid)
-        return samples, valid_mean(likeness.ravel(), valid.ravel())
+        settings = self.gamma, self.trace_decay, self.off_policy_trace, self.pessimism
+        y, likeness = double_q.targets(state.controller, s, step, valid, b, key, *settings)
+        return Samples(belief[:-1], step.prev_action[1:], y, valid), valid_mean(likeness.ravel(), valid.ravel())
 
     def update(self, state: State, batch: Samples, key: Key[Array, ""]) -> tuple[State, Metrics]:
         given = state.controller_optimiser, state.controller, batch, key
-        settings = self.tau, self.actor_regulariser, self.target_entropy
+        settings = self.tau, self.actor_regulariser, self.pessimism, self.target_entropy
         controller, optimiser, metrics = double_q.update(self.optimisers, *given, *settings)
         followed = average.follow(state.average, (state.model, controller.actor), self.average_rate)
         return state._replace(controller=controller, controller_optimiser=optimiser, average=followed), metrics

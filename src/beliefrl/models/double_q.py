@@ -2,12 +2,16 @@
 
 Source: Haarnoja et al. 2019, Algorithm 1, with λ-returns as the targets (`returns`), where s is the belief:
 
-    V̄(s) = min_i Q̄_i(s, ã)
+    Q_low = min_i Q_i + (1 - P) |Q_1 - Q_2| / 2
+    V̄(s) = Q̄_low(s, ã)
     y_t  = r_t + γ (1 - terminated) ((1 - c_{t+1}) V̄(s_{t+1}) + c_{t+1} y_{t+1})
     c_t  = λ (ω + (1 - ω) min(1, π(a_t|s_t) / b(a_t|s_t)))
     J_Q  = E ½ ((Q_i(s, a) - y) / u)²,  summed over i
-    J_π  = E α log π(ã|s) - min_i Q_i(s, ã) / u  +  regulariser · ½ E μ²
+    J_π  = E α log π(ã|s) - Q_low(s, ã) / u  +  regulariser · ½ E μ²
     J_α  = E -log α (log π(ã|s) + H_target)
+
+With the pessimism P = 1, Q_low is the smaller of the two Q, and with P = 0 it is their mean. The smaller one avoids
+values that are too high. But where the two disagree it is low, and the policy avoids what it has seldom tried.
 
 b is the policy that chose a. Where the present policy is less likely to choose a, the trace c is shorter, so the
 rewards after it count less. With ω = 0 a return ends at the first action that π would not choose. With ω = 1 all
@@ -36,7 +40,7 @@ from beliefrl.models.soft_actor_critic import (
     Optimisers,
     OptimiserState,
     alpha_loss,
-    least,
+    q_value,
     soft_update,
     squared_errors,
     valid_mean,
@@ -134,6 +138,17 @@ def sample(
     return action, log_prob, policy
 
 
+def q_low(
+    critics: tuple[MLP, MLP],
+    belief: Float[Array, "batch belief"],
+    action: Float[Array, "batch action"],
+    pessimism: float,
+) -> Float[Array, " batch"]:
+    """Q_low(s, a)."""
+    one, two = (q_value(critic, belief, action) for critic in critics)
+    return jnp.minimum(one, two) + (1 - pessimism) / 2 * jnp.abs(one - two)
+
+
 def likeness(policy: Policy, behaviour: Policy, action: Float[Array, "*batch action"]) -> Float[Array, "*batch"]:
     """min(1, π(a|s) / b(a|s)), from the densities before the tanh, because its derivative cancels."""
     before = jnp.arctanh(jnp.clip(action, -ACTION_MAX, ACTION_MAX))
@@ -151,6 +166,7 @@ def targets(
     gamma: float,
     decay: float,
     off_policy: float,
+    pessimism: float,
 ) -> tuple[Float[Array, "length batch"], Float[Array, "length batch"]]:
     """y_t of the transitions between length + 1 timesteps, and min(1, π / b) there.
 
@@ -160,11 +176,11 @@ def targets(
         valid: as for `n_step_returns`.
         behaviour: b(a|s_t) at the timesteps.
         key: the randomness of ã.
-        gamma, decay, off_policy: γ, λ and ω.
+        gamma, decay, off_policy, pessimism: γ, λ, ω and P.
     """
     flat = belief.reshape(-1, belief.shape[-1])
     action, _, policy = sample(controller.actor, flat, key)
-    value = (controller.unit.u * least(controller.targets, flat, action)).reshape(belief.shape[:2])
+    value = (controller.unit.u * q_low(controller.targets, flat, action, pessimism)).reshape(belief.shape[:2])
     policy = jax.tree.map(lambda leaf: leaf.reshape(*belief.shape[:2], -1)[:-1], policy)
     like = likeness(policy, jax.tree.map(lambda leaf: leaf[:-1], behaviour), step.prev_action[1:])
     trace = decay * (off_policy + (1 - off_policy) * like)
@@ -197,11 +213,16 @@ def q_loss(critics: tuple[MLP, MLP], batch: Samples, unit: Float[Array, ""]) -> 
 
 
 def actor_loss(
-    actor: OneTrunkActor, controller: DoubleQController, batch: Samples, key: Key[Array, ""], regulariser: float
+    actor: OneTrunkActor,
+    controller: DoubleQController,
+    batch: Samples,
+    key: Key[Array, ""],
+    regulariser: float,
+    pessimism: float,
 ) -> tuple[Float[Array, ""], tuple[Float[Array, " batch"], Float[Array, " batch"]]]:
-    """J_π; also returns min_i Q_i(s, ã) / u and log π(ã|s)."""
+    """J_π; also returns Q_low(s, ã) / u and log π(ã|s)."""
     action, log_prob, policy = sample(actor, batch.belief, key)
-    q = least(controller.critics, batch.belief, action)
+    q = q_low(controller.critics, batch.belief, action, pessimism)
     size = 0.5 * regulariser * jnp.mean(policy.mean**2, axis=-1)
     return valid_mean(jnp.exp(controller.log_alpha) * log_prob - q + size, batch.valid), (q, log_prob)
 
@@ -214,6 +235,7 @@ def update(
     key: Key[Array, ""],
     tau: float,
     regulariser: float,
+    pessimism: float,
     target_entropy: float | None = None,
 ) -> tuple[DoubleQController, OptimiserState, dict[str, Float[Array, ""]]]:
     """One step of every optimiser, then a soft update of Q̄.
@@ -223,7 +245,7 @@ def update(
     controller = rescale(controller, batch.target, batch.valid)
     j_q, grad_critics = jax.value_and_grad(q_loss)(controller.critics, batch, controller.unit.u)
     differentiate = jax.value_and_grad(actor_loss, has_aux=True)
-    (j_pi, (q, log_prob)), grad_actor = differentiate(controller.actor, controller, batch, key, regulariser)
+    (j_pi, (q, log_prob)), grad_actor = differentiate(controller.actor, controller, batch, key, regulariser, pessimism)
     entropy = wanted_entropy(batch.action, target_entropy)
     grad_alpha = jax.grad(alpha_loss)(controller.log_alpha, log_prob, batch.valid, entropy)
     actor, s_actor = descend(optimisers.actor, grad_actor, state.actor, controller.actor)
