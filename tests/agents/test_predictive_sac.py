@@ -235,11 +235,11 @@ def test_traces_use_the_policy_noted_at_their_timestep(state, begun):
     keys = jax.random.split(jax.random.key(7))
     policy = Policy(*(0.5 * jax.random.normal(key, window.step.prev_action.shape) for key in keys))
     window = window._replace(note=window.note._replace(policy=policy))
-    agent, key = dataclasses.replace(AGENT, trace_decay=0.8, off_policy_trace=0.0), jax.random.key(2)
+    agent, key = dataclasses.replace(AGENT, trace_decay=0.8, off_policy_trace=0.0, pessimism=0.25), jax.random.key(2)
     after, _, _ = jax.jit(agent.begin_cycle)(state, window, key)
     belief = jax.jit(agent.learn_model)(state, window)[1]
     valid, key = jnp.ones((6, 2), bool), jax.random.split(key)[0]
-    given = standardise(after.scales.belief, belief), window.step, valid, policy, key, agent.gamma, 0.8, 0.0, 1.0
+    given = standardise(after.scales.belief, belief), window.step, valid, policy, key, agent.gamma, 0.8, 0.0, 0.25
     y, _ = jax.jit(lambda: double_q.targets(state.controller, *given))()
     np.testing.assert_allclose(after.pool.transitions.target[0], y.ravel(), rtol=1e-4, atol=1e-5)
 
@@ -363,6 +363,7 @@ def test_what_does_not_exist_changes_nothing(state):
         ("jump", 1.5),
         ("long_memories", 1.5),
         ("trace_decay", 1.5),
+        ("pessimism", 1.5),
         ("off_policy_trace", -0.1),
         ("alpha_start", -1.0),
         ("average_rate", 0.0),

@@ -54,7 +54,7 @@ def test_a_run_that_is_older_than_a_setting_gets_no_value_for_it_when_a_file_is_
     file = tmp_path / "kept.json.gz"
     run = a_run(tmp_path / "run", [flat(1.0)], settings={"gamma": 0.9, "layers": [256, 256], "tau": 0.005})
     kept = packed(file, run)
-    for value in (False, True):  # a later version has the setting, and a still later one another default
+    for value in (False, True):  # a later version adds the setting; a still later one changes its default
         results.write(file, kept, {"vrm": {**DEFAULTS["vrm"], "normalise": value}})
         kept = results.read(file)
         assert kept[0].config["hyperparameters"] == run.config["hyperparameters"]

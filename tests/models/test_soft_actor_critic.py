@@ -214,13 +214,13 @@ def density(policy, action):
     return np.prod(np.exp(-0.5 * ((before - policy.mean) / sigma) ** 2) / sigma, axis=-1)
 
 
-def lower(one, two, pessimism):
+def q_low(one, two, pessimism):
     """The smaller value for a pessimism of 1, and the mean for 0."""
     return pessimism * np.minimum(one, two) + (1 - pessimism) * (one + two) / 2
 
 
 @pytest.mark.parametrize("pessimism", [1.0, 0.25])
-def test_targets_mix_the_lower_target_s_values_by_how_likely_the_actions_are(pessimism):
+def test_targets_mix_the_values_of_the_target_networks_by_how_likely_the_actions_are(pessimism):
     controller, key, time = make(), jax.random.key(3), 4
     keys = jax.random.split(jax.random.key(5), 5)
     belief = jax.random.normal(keys[0], (time, 2, BELIEF))
@@ -235,7 +235,7 @@ def test_targets_mix_the_lower_target_s_values_by_how_likely_the_actions_are(pes
     flat = np.asarray(belief).reshape(-1, BELIEF)
     noise = np.asarray(jax.random.normal(key, (time * 2, ACTION)))
     sampled, _, _ = policy(controller.actor, flat, noise)
-    value = 3 * lower(*(q(critic, flat, sampled) for critic in controller.targets), pessimism).reshape(time, 2)  # u = 3
+    value = 3 * q_low(*(q(critic, flat, sampled) for critic in controller.targets), pessimism).reshape(time, 2)  # u = 3
     now = Policy(*np.split(dense(controller.actor.network, np.asarray(belief)), 2, axis=-1))
     ahead = value[-1]
     for t in reversed(range(time - 1)):
@@ -269,7 +269,7 @@ def test_the_losses_are_their_formulas_over_valid_transitions(pessimism):
         controller.actor, controller, data, key, 0.2, pessimism
     )
     action, density, mean = policy(controller.actor, data.belief, np.asarray(jax.random.normal(key, (COUNT, ACTION))))
-    values = lower(*(q(critic, data.belief, action) for critic in controller.critics), pessimism)
+    values = q_low(*(q(critic, data.belief, action) for critic in controller.critics), pessimism)
     np.testing.assert_allclose(low, values, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(log_prob, density, rtol=1e-4, atol=1e-4)
     expected = 0.1 * density - values + 0.5 * 0.2 * np.mean(mean**2, axis=-1)

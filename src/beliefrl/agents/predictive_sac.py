@@ -85,7 +85,7 @@ class PredictiveSACAgent(ControllerAgent):
     """ω, in [0, 1]: at an action that the present policy would not choose, the trace is ωλ. With 1, it is λ everywhere,
     whichever policy chose the action."""
     pessimism: float = 1.0
-    """P, in [0, 1]. With 1, actor and targets use the smaller of the two Q. With 0, they use their mean."""
+    """P, in [0, 1]. The actor and the targets use the smaller Q (1), the mean of the two (0), or a mixture."""
     train_interval_rl: int = 1
     """Environment steps between two updates of the model."""
     updates_per_step: int = 1

@@ -1,12 +1,11 @@
 """Files of results: the runs of an experiment in one small file, NAME.json.gz. Figures read it like folders of runs.
 
-    {"format": 1, "defaults": {AGENT: {NAME: value}}, "runs": [{"name", "config", "rows": {SEED: [row]}}]}
+    {"format": 1, "defaults": {AGENT: {NAME: value}}, "runs": [{"name", "config", "lacks", "rows": {SEED: [row]}}]}
 
 `config` is the run's config.json, but only with the hyperparameters that differ from the agent's `defaults` in the
 file. A run that is older than some hyperparameters has their names under `lacks`: their values are not known, because a
 default may have changed since. The rows are the evaluations, the divergences, and the means of `SERIES` over the
-updates between evaluations.
-Numbers have six significant digits.
+updates between evaluations. Numbers have six significant digits.
 """
 
 import gzip
@@ -49,7 +48,7 @@ def cut(run: Run, until: int) -> KeptRun:
 
 
 def read(path: pathlib.Path) -> list[KeptRun]:
-    """The runs in a file of results, with all their hyperparameters.
+    """The runs in a file of results, with the hyperparameters that they had.
 
     Raises:
         UserError: there is no such file, or it is not a file of results.
