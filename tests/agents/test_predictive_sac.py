@@ -244,6 +244,12 @@ def test_traces_use_the_policy_noted_at_their_timestep(state, begun):
     np.testing.assert_allclose(after.pool.transitions.target[0], y.ravel(), rtol=1e-4, atol=1e-5)
 
 
+def test_a_pessimism_of_0_gives_the_actor_higher_values(state, begun):
+    batch, key = jax.tree.map(lambda leaf: leaf[0], begun[1]), jax.random.key(2)
+    low, mean = (dataclasses.replace(AGENT, pessimism=pessimism) for pessimism in (1.0, 0.0))
+    assert jax.jit(mean.update)(state, batch, key)[1]["q"] > jax.jit(low.update)(state, batch, key)[1]["q"]
+
+
 def test_a_batch_is_standardised_and_drawn_from_all_cycles_in_the_pool(state, begun):
     after, batches, _ = begun
     assert batches.target.shape == (1, 16)

@@ -123,8 +123,8 @@ def _packed(run: Run, usual: Row) -> dict[str, Any]:
     text = json.dumps(run.config | {"hyperparameters": changed(ordered, usual)})
     config = json.loads(re.sub(r'"/[^"]*/(runs/[^"]*)"', r'"\1"', text))  # cut absolute paths to runs/...
     lacks = [name for name in usual if name not in own]
-    entry = {"name": run.folder.name, "config": config, "rows": {seed: _kept_rows(run, seed) for seed in run.seeds}}
-    return entry | ({"lacks": lacks} if lacks else {})
+    rows = {seed: _kept_rows(run, seed) for seed in run.seeds}
+    return {"name": run.folder.name, "config": config, "lacks": lacks, "rows": rows}
 
 
 def _kept_rows(run: Run, seed: int) -> list[Row]:
