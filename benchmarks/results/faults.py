@@ -39,7 +39,7 @@ def experiments(seeds, levels, **settings):
 def returns(runs):
     """{agent: {(fault, level): final returns (seed,) with mode actions}}; without faults the level is 0 of each."""
     table = {agent: {} for agent in AGENTS}
-    for group in groups.groups(runs, agents.defaults()):
+    for group in groups.groups(runs, agents.defaults(), agents.before()):
         final = group.curve("mode").seeds[:, -1]
         faults = group.runs[0].config.get("faults") or dict.fromkeys(LEVELS, 0.0)
         table[group.agent] |= dict.fromkeys(faults.items(), final)

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from beliefrl import agents
-from beliefrl.agents import hyperparameters
+from beliefrl.agents import hyperparameters, named
+from beliefrl.agents.predictive_sac import PredictiveSACAgent
 from beliefrl.agents.sac_mlp import SACMLPAgent
 from beliefrl.agents.vrm import VRMAgent
 from beliefrl.policy import Policy
@@ -109,6 +110,18 @@ def test_an_agent_is_restored_from_its_record(agent):
     other = dataclasses.replace(agent, step_start_rl=99)
     assert hyperparameters.restored(other, recorded(agent)) == agent
     assert hash(hyperparameters.restored(other, recorded(agent))) == hash(agent)
+
+
+def test_what_a_record_lacks_has_the_value_from_before_it_existed():
+    record = recorded(named("predictive-sac"))
+    for newer in ("normalise_critics", "lr_model_min", "pessimism"):
+        del record[newer]
+    made = hyperparameters.restored(PredictiveSACAgent, record)
+    assert (made.normalise_critics, made.pessimism) == (False, 1.0)
+    assert made.lr_model_min >= made.lr_model  # the learning rate is constant
+    for name, values in agents.before().items():
+        assert values.keys() <= hyperparameters.of(named(name)).keys()
+        hyperparameters.build(named(name), values)  # they are possible
 
 
 def test_dataclasses_in_an_agent_are_restored_and_functions_kept():

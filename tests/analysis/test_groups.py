@@ -55,6 +55,19 @@ def test_a_run_older_than_a_setting_has_its_default_and_defaults_are_not_named(t
     ]
 
 
+def test_a_run_older_than_a_setting_has_what_it_had_in_effect_where_that_is_known(tmp_path):
+    made = [
+        a_run(tmp_path / "old", [flat(1.0)], settings={"gamma": 0.99}),
+        a_run(tmp_path / "new", [flat(1.0)], settings={"gamma": 0.99, "normalise": True}),
+        a_run(tmp_path / "without", [flat(1.0)], settings={"gamma": 0.99, "normalise": False}, first=1),
+    ]
+    defaults, before = {"vrm": {"gamma": 0.99, "normalise": True}}, {"vrm": {"normalise": False}}
+    assert labels(groups(made, defaults, before)) == [
+        ("pendulum-v", "vrm normalise=False", [0, 1]),
+        ("pendulum-v", "vrm", [0]),
+    ]
+
+
 def test_constants_of_a_task_set_it_apart_from_the_same_task_only(tmp_path):
     made = [
         a_run(tmp_path / "a", [flat(1.0)], constants={"length": 1.0}),

@@ -144,7 +144,7 @@ def test_a_missing_file_and_one_of_a_later_version_are_errors(tmp_path):
 @pytest.mark.parametrize("path", KEPT, ids=lambda path: path.name)
 def test_every_file_of_results_here_can_be_drawn(path):
     runs = groups.find([path]).runs
-    made = groups.groups([run for run in runs if groups.is_finished(run)] or runs, agents.defaults())
+    made = groups.groups([run for run in runs if groups.is_finished(run)] or runs, agents.defaults(), agents.before())
     assert all(group.curve().steps.size for group in made)
 
 

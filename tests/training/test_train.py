@@ -257,6 +257,8 @@ def test_other_layers_are_one_sentence_and_no_folder(tmp_path, recorded):
     config["hyperparameters"] |= recorded
     (source.folder / "config.json").write_text(json.dumps(config))
     initial.taken(Options(init_from=str(source.folder)), tiny("predictive-sac", normalise_critics=False), TASK.spec)
+    with pytest.raises(UserError, match=r"was trained with normalise_critics=False, not True"):
+        train(tiny("predictive-sac"), TASK, source.folder, resume=True, **source.config["options"])
     with pytest.raises(UserError, match="normalise_critics=False, and this training has True; set normalise_critics=F"):
         train(tiny("predictive-sac"), TASK, tmp_path / "run", init_from=source)
     assert not (tmp_path / "run").exists()

@@ -8,7 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl import catalogue
-from beliefrl.agents.hyperparameters import build
+from beliefrl.agents.hyperparameters import build, values_before
 from beliefrl.catalogue import AGENT_GROUP as GROUP
 from beliefrl.catalogue import agent_names as names  # noqa: F401 - agents.names
 from beliefrl.imports import declared, declared_name, is_named, load, load_declared, path
@@ -128,6 +128,12 @@ AGENTS: dict[str, Any] = {name: load(known.path)(**known.hyperparameters) for na
 def defaults() -> dict[str, dict[str, Any]]:
     """The hyperparameters of each built-in name, in the form of JSON."""
     return {name: json.loads(json.dumps(dataclasses.asdict(agent))) for name, agent in AGENTS.items()}
+
+
+@functools.cache
+def before() -> dict[str, dict[str, Any]]:
+    """For each built-in name the values of hyperparameters from before they existed."""
+    return {name: values_before(agent) for name, agent in AGENTS.items()}
 
 
 def find_class(name: str) -> type:

@@ -71,17 +71,26 @@ def of(agent: Any) -> dict[str, Any]:
     return {field.name: values[field.name] for field in dataclasses.fields(agent) if field.init}
 
 
+def values_before(agent: Any) -> dict[str, Any]:
+    """The values that hyperparameters of an agent had, in effect, in runs from before they existed.
+
+    The class attribute `values_before` of an agent has these values, as JSON. Without it they are the defaults.
+    """
+    return dict(getattr(agent, "values_before", {}))
+
+
 def restored(agent: Any, recorded: Mapping[str, Any]) -> Any:
     """An agent like this one, or of this class, with hyperparameters that were recorded as JSON.
 
-    JSON cannot represent some values, such as functions. For these the agent keeps its own values.
+    JSON cannot represent some values, such as functions. For these the agent keeps its own values. A hyperparameter
+    that the record lacks has its value in `values_before`, or else its default.
 
     Raises:
         UserError: as `build`.
     """
     like: Any = build(agent, {}) if isinstance(agent, type) and not _required(agent) else agent
     values = {}
-    for name, value in tuples(recorded).items():
+    for name, value in tuples(values_before(like) | dict(recorded)).items():
         own = getattr(like, name, None)
         if dataclasses.is_dataclass(own) and isinstance(value, dict):
             values[name] = restored(own, value)

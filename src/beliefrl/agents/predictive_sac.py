@@ -158,6 +158,7 @@ class PredictiveSACAgent(ControllerAgent):
         "long_memories": Range(0.0, 0.5),
         "pool": (4, 8, 16),
     }
+    values_before = {"normalise_critics": False, "lr_model_min": 1.0, "average_rate": 1.0}  # in runs from before them
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""

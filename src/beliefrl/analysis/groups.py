@@ -120,17 +120,22 @@ def _diverged(run: Run, seed: int) -> bool:
     return any(run.rows(seed, "diverged"))
 
 
-def groups(runs: Sequence[Run], defaults: Mapping[str, Row] | None = None) -> list[Group]:
+def groups(
+    runs: Sequence[Run], defaults: Mapping[str, Row] | None = None, before: Mapping[str, Row] | None = None
+) -> list[Group]:
     """The runs' seeds, grouped; tasks and agents keep the order in which they first occur.
 
-    `defaults` are the default settings of each agent by name (`agents.defaults`). They fill in settings that a run
-    lacks because it is older than these settings. A setting with its default value is not shown in a label.
+    `defaults` are the default settings of each agent by name (`agents.defaults`), and `before` are values from before
+    a setting existed (`agents.before`). Both fill in settings that a run lacks because it is older than these settings,
+    first `before`. A setting with its default value is not shown in a label.
 
     If a seed was trained several times with the same settings, only the run with the most steps counts, and among equal
     ones the latest: equal seed numbers give equal trainings, which must not count as several samples.
     """
     usual = {run.config["agent"]: (defaults or {}).get(run.config["agent"], {}) for run in runs}
-    settings = {run.folder: usual[run.config["agent"]] | run.config["hyperparameters"] for run in runs}
+    older = {run.config["agent"]: (before or {}).get(run.config["agent"], {}) for run in runs}
+    filled = {agent: usual[agent] | older[agent] for agent in usual}
+    settings = {run.folder: filled[run.config["agent"]] | run.config["hyperparameters"] for run in runs}
     seeds: dict[tuple[str, str], dict[int, Run]] = {}
     for run in runs:
         same_agent = [settings[other.folder] for other in runs if other.config["agent"] == run.config["agent"]]

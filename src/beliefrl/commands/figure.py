@@ -88,7 +88,7 @@ def _draw(kind: str, runs: Sequence[Any], out: pathlib.Path, actions: str) -> pa
                 f"This figure shows one run: choose one of these {len(runs)} by --names, --agents or --tasks."
             )
         return save(curve_figure(runs[0]), out)
-    lines = groups(runs, agents.defaults())
+    lines = groups(runs, agents.defaults(), agents.before())
     if kind in TABLES:
         return (tables.write_costs if kind == "scalability" else tables.write_final)(lines, out)
     if kind == "elbo":

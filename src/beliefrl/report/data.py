@@ -48,7 +48,7 @@ def page_data(runs: Sequence[Run], page_folder: pathlib.Path, unfinished: bool =
     an evaluation; the curve of a group then ends at the last step that all its seeds have reached.
     """
     counted = [run for run in runs if is_finished(run) or (unfinished and _has_begun(run))]
-    lines = [group for group in groups(counted, agents.defaults()) if group.curve().steps.size]
+    lines = [group for group in groups(counted, agents.defaults(), agents.before()) if group.curve().steps.size]
     group_of = {(run.folder, seed): index for index, group in enumerate(lines) for run, seed in group.seeds}
     palette = colours([group.label for group in lines])
     dash = dashes(list(palette))
@@ -150,7 +150,8 @@ def settings(config: dict[str, Any]) -> list[str] | None:
     defaults = agents.defaults().get(config["agent"])
     if defaults is None:
         return None
-    return [f"{name}={value}" for name, value in changed(config["hyperparameters"], defaults).items()]
+    known = agents.before()[config["agent"]] | config["hyperparameters"]
+    return [f"{name}={value}" for name, value in changed(known, defaults).items()]
 
 
 def _session(session: dict[str, Any]) -> dict[str, str]:

@@ -10,6 +10,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
 
+from beliefrl.agents.hyperparameters import values_before
 from beliefrl.analysis.figures import curve_figure
 from beliefrl.analysis.tables import measure_text
 from beliefrl.runs.best import evaluations
@@ -152,7 +153,8 @@ def run_table(run: Run, agent: Any) -> Table:
 
     config = run.config
     own = {} if agent is None else {field.name: field.default for field in dataclasses.fields(agent)}
-    changed = [f"{name}={value}" for name, value in config["hyperparameters"].items() if _differs(value, own.get(name))]
+    known = values_before(agent) | config["hyperparameters"]
+    changed = [f"{name}={value}" for name, value in known.items() if _differs(value, own.get(name))]
     constants = [f"{name}={value}" for name, value in config["constants"].items()]
     observed = [] if config.get("observe") is None else [f"observe={' '.join(map(str, config['observe']))}"]
     faults = [f"{name}={value}" for name, value in config.get("faults", {}).items()]

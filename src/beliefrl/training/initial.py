@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from beliefrl.agents import Agent
+from beliefrl.agents.hyperparameters import values_before
 from beliefrl.runs import arrays, best
 from beliefrl.runs.options import Options
 from beliefrl.runs.run import Run
@@ -76,7 +77,7 @@ def _last_evaluations(source: Run) -> list[dict[str, Any] | None]:
 def _refuse_other_layers(source: Run, agent: Agent) -> None:
     """Layer normalisation has no arrays of its own, so `_fitting` cannot see it. Runs from before it have no entry."""
     here = getattr(agent, "normalise_critics", False)
-    there = source.config["hyperparameters"].get("normalise_critics", False)
+    there = (values_before(agent) | source.config["hyperparameters"]).get("normalise_critics", False)
     if there != here:
         raise UserError(
             f"{source.folder} cannot be init_from: it was trained with normalise_critics={there}, and this training "

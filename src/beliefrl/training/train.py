@@ -82,7 +82,7 @@ def train(
     }
     if resume and out is not None and os.path.exists(os.path.join(out, "config.json")):  # noqa: PTH110, PTH118 - pathlib's raises where a name is too long
         run, own = Run(out), agent if agents.is_own(config["agent"]) else None
-        _check_same(run, config)
+        _check_same(run, config, hyperparameters.values_before(agent))
         changes = {name: getattr(chosen, name) for name in CHANGEABLE}
         return _go_on(run, changes, made, (report, callback), own, own_process, progress)
     networks = None
@@ -226,12 +226,15 @@ def _check_possible(options: Options, task: Any, own_process: bool) -> None:
         )
 
 
-def _check_same(run: Run, config: dict[str, Any]) -> None:
-    """Raise a UserError if a run was trained with other settings than those of `config`, except CHANGEABLE options."""
+def _check_same(run: Run, config: dict[str, Any], older: dict[str, Any]) -> None:
+    """Raise a UserError if a run was trained with other settings than those of `config`, except CHANGEABLE options.
+
+    `older` are the values of hyperparameters from before they existed.
+    """
     asked = {name: config.get(name) for name in ("agent", "task", "constants", "observe", "faults")}
     asked |= config["options"] | _with_functions_of(run.config["hyperparameters"], config["hyperparameters"])
-    asked = json.loads(json.dumps(asked, default=str))  # tuples are lists in the run's config
     before = {"faults": None} | dataclasses.asdict(Options())  # what an older version did not record, it did not have
+    asked, before = json.loads(json.dumps([asked, before | older], default=str))  # tuples are lists in the run's config
     there = before | run.config | run.config["options"] | run.config["hyperparameters"]
     there |= {name: asked[name] for name in CHANGEABLE}
     for name, value in asked.items():
