@@ -9,7 +9,7 @@ import numpy as np
 import optax
 import pytest
 
-from beliefrl.models import double_q
+from beliefrl.models import double_q, two_hot
 from beliefrl.models import soft_actor_critic as sac
 from beliefrl.models.double_q import Policy, Samples, Unit, init_optimisers
 from beliefrl.models.nets import tanh_gaussian
@@ -173,9 +173,9 @@ COUNT = 12
 KEY = jax.random.key(0)
 
 
-def make(key=KEY, normalise=False):
+def make(key=KEY, normalise=False, classes=1):
     sizes = BELIEF, ACTION, (8, 8), (8, 8)
-    controller = jax.jit(lambda key: double_q.init_controller(key, *sizes, 0.1, normalise))(key)
+    controller = jax.jit(lambda key: double_q.init_controller(key, *sizes, 0.1, normalise, classes))(key)
     return controller._replace(unit=Unit(jnp.array(9.0), jnp.array(4.0)))
 
 
@@ -196,8 +196,17 @@ def dense(network, x):
     return x
 
 
+def outputs(critic, belief, action):
+    return dense(critic, np.concatenate([belief, action], axis=-1))
+
+
+def softmax(logits):
+    return np.exp(logits) / np.exp(logits).sum(axis=-1, keepdims=True)
+
+
 def q(critic, belief, action):
-    return dense(critic, np.concatenate([belief, action], axis=-1))[:, 0]
+    out = outputs(critic, belief, action)
+    return out[:, 0] if out.shape[-1] == 1 else softmax(out) @ np.asarray(two_hot.numbers(out.shape[-1]))
 
 
 def policy(actor, belief, noise):
@@ -219,9 +228,9 @@ def q_low(one, two, pessimism):
     return pessimism * np.minimum(one, two) + (1 - pessimism) * (one + two) / 2
 
 
-@pytest.mark.parametrize("pessimism", [1.0, 0.25])
-def test_targets_mix_the_values_of_the_target_networks_by_how_likely_the_actions_are(pessimism):
-    controller, key, time = make(), jax.random.key(3), 4
+@pytest.mark.parametrize(("pessimism", "classes"), [(1.0, 1), (0.25, 1), (0.25, 21)])
+def test_targets_mix_the_values_of_the_target_networks_by_how_likely_the_actions_are(pessimism, classes):
+    controller, key, time = make(classes=classes), jax.random.key(3), 4
     keys = jax.random.split(jax.random.key(5), 5)
     belief = jax.random.normal(keys[0], (time, 2, BELIEF))
     action = jnp.tanh(jax.random.normal(keys[1], (time, 2, ACTION)))
@@ -257,12 +266,16 @@ def test_an_action_at_the_bound_has_a_finite_likeness():
         np.testing.assert_allclose(double_q.likeness(policy, behaviour, action), expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("pessimism", [1.0, 0.25])
-def test_the_losses_are_their_formulas_over_valid_transitions(pessimism):
-    controller, data, key = make(), random_batch(), jax.random.key(3)
+@pytest.mark.parametrize(("pessimism", "classes"), [(1.0, 1), (0.25, 1), (1.0, 21)])
+def test_the_losses_are_their_formulas_over_valid_transitions(pessimism, classes):
+    controller, data, key = make(classes=classes), random_batch(), jax.random.key(3)
     valid, u = np.asarray(data.valid), float(controller.unit.u)
-    errors = [q(critic, data.belief, data.action) - np.asarray(data.target) / u for critic in controller.critics]
-    expected = np.mean(sum(0.5 * error[valid] ** 2 for error in errors))
+    y, out = data.target / u, [outputs(critic, data.belief, data.action) for critic in controller.critics]
+    if classes == 1:
+        errors = [0.5 * (each[:, 0] - np.asarray(y)) ** 2 for each in out]
+    else:
+        errors = [-np.sum(np.asarray(two_hot.two_hot(y, classes)) * np.log(softmax(each)), axis=-1) for each in out]
+    expected = np.mean(sum(error[valid] for error in errors))
     np.testing.assert_allclose(double_q.q_loss(controller.critics, data, controller.unit.u), expected, rtol=1e-4)
 
     j_pi, (low, log_prob) = jax.jit(double_q.actor_loss, static_argnums=(4, 5))(
@@ -284,6 +297,13 @@ def test_a_new_unit_leaves_every_q_as_it_is(normalise):
     for old, new in zip((*controller.critics, *controller.targets), (*after.critics, *after.targets), strict=True):
         before, now = (q(critic, data.belief, data.action) for critic in (old, new))
         np.testing.assert_allclose(float(after.unit.u) * now, float(controller.unit.u) * before, rtol=1e-4, atol=1e-4)
+
+
+def test_with_classes_a_new_unit_leaves_the_networks_as_they_are():
+    controller, data = make(classes=5), random_batch()
+    after = jax.jit(double_q.rescale)(controller, 100 * data.target, data.valid)
+    assert after.unit.u > 2 * controller.unit.u
+    jax.tree.map(np.testing.assert_array_equal, after.critics, controller.critics)
 
 
 def test_a_batch_without_valid_targets_does_not_change_the_unit():

@@ -108,6 +108,9 @@ class PredictiveSACAgent(ControllerAgent):
     """Hidden layers of each Q."""
     normalise_critics: bool = True
     """Layer normalisation, without gains, before each activation of the Q networks (Ba et al. 2016)."""
+    critic_classes: int = 1
+    """Fixed numbers over which a Q network gives a distribution, learned by cross-entropy (`models.two_hot`). With 1,
+    it gives Q itself, learned by squared errors."""
     actor_regulariser: float = 1e-3
     """Weight of half the mean square of the policy's μ in the actor's loss."""
 
@@ -147,6 +150,7 @@ class PredictiveSACAgent(ControllerAgent):
     ranges = ControllerAgent.ranges | {
         "updates_per_step": (1, 2, 4),
         "normalise_critics": (False, True),
+        "critic_classes": (1, 101),
         "batch_size": (64, 128, 256, 512),
         "trace_decay": Range(0.8, 1.0),
         "pessimism": Range(0.0, 1.0),
@@ -164,6 +168,7 @@ class PredictiveSACAgent(ControllerAgent):
         """Refuse impossible values with a UserError."""
         super().__post_init__()
         check_range(self, ("updates_per_step", "batch_size", "lr_model_updates", "seq_len", "sequences", "pool"), 1)
+        check_range(self, ("critic_classes",), 1, WIDEST)
         check_range(self, ("d_size", "hidden_size"), 1, WIDEST)
         check_range(self, ("pretrain_updates",), 0)
         check_range(self, ("alpha_start",), 1e-6)
@@ -199,7 +204,7 @@ class PredictiveSACAgent(ControllerAgent):
         sizes = spec.obs_dim, spec.action_dim, len(self.reward_memory)
         model = init_model(key_model, *sizes, self.d_size, self.hidden_size, self.long_memories, self.longest_memory)
         belief = self.d_size + spec.obs_dim + spec.action_dim + 1
-        settings = self.policy_layers, self.value_layers, self.alpha_start, self.normalise_critics
+        settings = self.policy_layers, self.value_layers, self.alpha_start, self.normalise_critics, self.critic_classes
         controller = double_q.init_controller(key_controller, belief, spec.action_dim, *settings)
         return State(
             model,

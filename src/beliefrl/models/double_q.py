@@ -6,7 +6,7 @@ Source: Haarnoja et al. 2019, Algorithm 1, with λ-returns as the targets (`retu
     V̄(s) = Q̄_low(s, ã)
     y_t  = r_t + γ (1 - terminated) ((1 - c_{t+1}) V̄(s_{t+1}) + c_{t+1} y_{t+1})
     c_t  = λ (ω + (1 - ω) min(1, π(a_t|s_t) / b(a_t|s_t)))
-    J_Q  = E ½ ((Q_i(s, a) - y) / u)²,  summed over i
+    J_Q  = E ½ ((Q_i(s, a) - y) / u)²,  summed over i; with classes the cross-entropy of Q_i / u to y / u (`two_hot`)
     J_π  = E α log π(ã|s) - Q_low(s, ã) / u  +  regulariser · ½ E μ²
     J_α  = E -log α (log π(ã|s) + H_target)
 
@@ -20,7 +20,8 @@ target with V̄(s), so it is biased where the policies differ.
 
 u is a running root mean square of y. The networks of the critics return Q / u. When u changes, their last layers are
 rescaled, so that Q stays the same (van Hasselt et al. 2016, without their mean). So one learning rate and one
-temperature fit tasks with returns of any size. Departure: y does not contain the entropy. Over a horizon of 200 steps
+temperature fit tasks with returns of any size. With classes the last layers are not rescaled: Q changes with u, and
+learns its new size. Departure: y does not contain the entropy. Over a horizon of 200 steps
 the sum of entropies would exceed the rewards of most tasks. And because α is in units of u, u would influence itself.
 """
 
@@ -32,6 +33,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
+from beliefrl.models import two_hot
 from beliefrl.models.nets import MLP, descend, draw, gaussian_log_prob, tanh_gaussian
 from beliefrl.models.returns import lambda_returns
 from beliefrl.models.soft_actor_critic import (
@@ -40,9 +42,8 @@ from beliefrl.models.soft_actor_critic import (
     Optimisers,
     OptimiserState,
     alpha_loss,
-    q_value,
+    q_outputs,
     soft_update,
-    squared_errors,
     valid_mean,
     wanted_entropy,
 )
@@ -98,8 +99,8 @@ class DoubleQController(NamedTuple):
     """Everything that J_Q, J_π and J_α train."""
 
     actor: OneTrunkActor
-    critics: tuple[MLP, MLP]  # Q_1 / u, Q_2 / u
-    targets: tuple[MLP, MLP]  # Q̄_1 / u, Q̄_2 / u
+    critics: tuple[MLP, MLP]  # Q_1 / u, Q_2 / u, or their logits
+    targets: tuple[MLP, MLP]  # Q̄_1 / u, Q̄_2 / u, or their logits
     log_alpha: Float[Array, ""]
     unit: Unit
 
@@ -121,9 +122,13 @@ def init_controller(
     value_layers: tuple[int, ...],
     alpha: float,
     normalise_critics: bool = False,
+    classes: int = 1,
 ) -> DoubleQController:
-    """A new controller for beliefs and actions of these sizes; Q̄ starts as Q, α at `alpha`, u at 1."""
-    critic = MLP((belief + action, *value_layers, 1), jax.nn.relu, normalise_critics)
+    """A new controller for beliefs and actions of these sizes; Q̄ starts as Q, α at `alpha`, u at 1.
+
+    With one class, a critic gives Q / u. With more, it gives logits (`two_hot`).
+    """
+    critic = MLP((belief + action, *value_layers, classes), jax.nn.relu, normalise_critics)
     actor, critics = draw(key, (OneTrunkActor(belief, action, policy_layers), (critic, critic)))
     unit = Unit(jnp.ones(()), jnp.zeros(()))
     return DoubleQController(actor, critics, jax.tree.map(jnp.copy, critics), jnp.full((), math.log(alpha)), unit)
@@ -138,6 +143,11 @@ def sample(
     return action, log_prob, policy
 
 
+def q_value(outputs: Float[Array, "batch output"]) -> Float[Array, " batch"]:
+    """Q / u, given all outputs of a critic."""
+    return outputs[:, 0] if outputs.shape[-1] == 1 else two_hot.value(outputs)
+
+
 def q_low(
     critics: tuple[MLP, MLP],
     belief: Float[Array, "batch belief"],
@@ -145,7 +155,7 @@ def q_low(
     pessimism: float,
 ) -> Float[Array, " batch"]:
     """Q_low(s, a)."""
-    one, two = (q_value(critic, belief, action) for critic in critics)
+    one, two = (q_value(q_outputs(critic, belief, action)) for critic in critics)
     return jnp.minimum(one, two) + (1 - pessimism) / 2 * jnp.abs(one - two)
 
 
@@ -190,7 +200,10 @@ def targets(
 def rescale(
     controller: DoubleQController, y: Float[Array, " batch"], valid: Bool[Array, " batch"]
 ) -> DoubleQController:
-    """The controller with u updated by the valid targets of one more batch, if there are any; Q stays the same."""
+    """The controller with u updated by the valid targets of one more batch, if there are any.
+
+    Q stays the same, but with classes Q / u does.
+    """
     old, some = controller.unit, jnp.any(valid)
     rate = jnp.where(some, jnp.maximum(1 / (old.batches + 1), UNIT_RATE), 0.0)
     new = Unit(old.square + rate * (valid_mean(y**2, valid) - old.square), old.batches + some)
@@ -203,13 +216,20 @@ def rescale(
     def by_ratio(leaf: Array) -> Array:
         return leaf * (old.u / new.u)
 
+    if len(controller.critics[0].layers[-1].bias) > 1:  # classes
+        return controller._replace(unit=new)
     critics, targets = tuple(map(rescaled, controller.critics)), tuple(map(rescaled, controller.targets))
     return controller._replace(critics=critics, targets=targets, unit=new)
 
 
 def q_loss(critics: tuple[MLP, MLP], batch: Samples, unit: Float[Array, ""]) -> Float[Array, ""]:
     """J_Q of both critics, summed."""
-    return squared_errors(critics, batch.belief, batch.action, batch.target / unit, batch.valid)
+
+    def error(critic: MLP) -> Float[Array, " batch"]:
+        outputs, y = q_outputs(critic, batch.belief, batch.action), batch.target / unit
+        return 0.5 * (outputs[:, 0] - y) ** 2 if outputs.shape[-1] == 1 else two_hot.cross_entropy(outputs, y)
+
+    return valid_mean(error(critics[0]) + error(critics[1]), batch.valid)
 
 
 def actor_loss(

@@ -46,10 +46,17 @@ class Actor(eqx.Module):
 def q_value(
     critic: MLP, belief: Float[Array, "batch belief"], action: Float[Array, "batch action"]
 ) -> Float[Array, " batch"]:
-    """Q(s, a). The first layer is split, so that one product W_s s serves Q(s, a) and Q(s, ã)."""
+    """Q(s, a)."""
+    return q_outputs(critic, belief, action)[:, 0]
+
+
+def q_outputs(
+    critic: MLP, belief: Float[Array, "batch belief"], action: Float[Array, "batch action"]
+) -> Float[Array, "batch output"]:
+    """All outputs of a critic. The first layer is split, so that one product W_s s serves (s, a) and (s, ã)."""
     first, size = critic.layers[0], belief.shape[-1]
     projected = belief @ first.weight[:, :size].T
-    return jax.vmap(lambda s, a: critic.rest(s + a @ first.weight[:, size:].T + first.bias)[0])(projected, action)
+    return jax.vmap(lambda s, a: critic.rest(s + a @ first.weight[:, size:].T + first.bias))(projected, action)
 
 
 def least(
