@@ -132,7 +132,7 @@ def defaults() -> dict[str, dict[str, Any]]:
 
 @functools.cache
 def before() -> dict[str, dict[str, Any]]:
-    """For each built-in name the values of hyperparameters from before they existed."""
+    """For each built-in name the hyperparameters of runs that do not record them (`hyperparameters.values_before`)."""
     return {name: values_before(agent) for name, agent in AGENTS.items()}
 
 

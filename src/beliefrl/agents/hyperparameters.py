@@ -72,9 +72,9 @@ def of(agent: Any) -> dict[str, Any]:
 
 
 def values_before(agent: Any) -> dict[str, Any]:
-    """The values that hyperparameters of an agent had, in effect, in runs from before they existed.
+    """Values, as JSON, of the hyperparameters that older runs do not record: they describe how these runs were trained.
 
-    The class attribute `values_before` of an agent has these values, as JSON. Without it they are the defaults.
+    They are in the class attribute `values_before` of an agent. A hyperparameter that is not there had its default.
     """
     return dict(getattr(agent, "values_before", {}))
 

@@ -17,10 +17,9 @@ One unroll of the windows of a cycle serves both: the model learns from it, and 
 has the transitions of the last `pool` cycles with their targets, and the controller's batches are drawn from it. The
 windows of one cycle are too few and too correlated for a batch. There are as many readers as windows in the pool.
 
-In training the newest weights act. Evaluations and the trained agent use an average of the last weights of the model
-and of the actor (`models.average`). The policy of the newest weights can change within few updates. The average changes
-slowly. The learning rate of the model falls, because averages of a model and an actor fit together only if the beliefs
-change slowly.
+In training the newest weights act. Their policy can change within few updates. So evaluations and the trained agent use
+an average of the last weights of the model and of the actor (`models.average`). The learning rate of the model falls,
+because averages of a model and an actor fit together only if the beliefs change slowly.
 """
 
 import dataclasses
@@ -79,11 +78,9 @@ class PredictiveSACAgent(ControllerAgent):
 
     # The controller
     trace_decay: float = 0.95
-    """λ of the λ-returns from which the critics learn, in [0, 1]. With 0, a target has one reward and the value
-    of the next belief."""
+    """λ of the critics' λ-returns, in [0, 1]. With 0, a target has one reward and the value of the next belief."""
     off_policy_trace: float = 0.5
-    """ω, in [0, 1]: at an action that the present policy would not choose, the trace is ωλ. With 1, it is λ everywhere,
-    whichever policy chose the action."""
+    """ω, in [0, 1]: at an action that the present policy would not choose, the trace is ωλ. With 1, it is always λ."""
     pessimism: float = 1.0
     """P, in [0, 1]. The actor and the targets use the smaller Q (1), the mean of the two (0), or a mixture."""
     train_interval_rl: int = 1
@@ -109,8 +106,7 @@ class PredictiveSACAgent(ControllerAgent):
     normalise_critics: bool = True
     """Layer normalisation, without gains, before each activation of the Q networks (Ba et al. 2016)."""
     critic_classes: int = 1
-    """Fixed numbers over which a Q network gives a distribution, learned by cross-entropy (`models.two_hot`). With 1,
-    it gives Q itself, learned by squared errors."""
+    """Fixed numbers over which a Q network gives a distribution (`models.two_hot`). With 1, it gives Q itself."""
     actor_regulariser: float = 1e-3
     """Weight of half the mean square of the policy's μ in the actor's loss."""
 
@@ -168,8 +164,7 @@ class PredictiveSACAgent(ControllerAgent):
         """Refuse impossible values with a UserError."""
         super().__post_init__()
         check_range(self, ("updates_per_step", "batch_size", "lr_model_updates", "seq_len", "sequences", "pool"), 1)
-        check_range(self, ("critic_classes",), 1, WIDEST)
-        check_range(self, ("d_size", "hidden_size"), 1, WIDEST)
+        check_range(self, ("d_size", "hidden_size", "critic_classes"), 1, WIDEST)
         check_range(self, ("pretrain_updates",), 0)
         check_range(self, ("alpha_start",), 1e-6)
         check_range(self, ("lr_model", "lr_model_min", "jump"), 0, 1)
@@ -230,9 +225,8 @@ class PredictiveSACAgent(ControllerAgent):
     # Acting
 
     def reset(self, spec: Spec) -> Memory:
-        empty = LSTMState(jnp.zeros(self.d_size), jnp.zeros(self.d_size))
-        policy = Policy(jnp.zeros(spec.action_dim), jnp.zeros(spec.action_dim))
-        return Memory(empty, Note(jnp.zeros(len(self.reward_memory)), policy))
+        note = Note(jnp.zeros(len(self.reward_memory)), Policy(*jnp.zeros((2, spec.action_dim))))
+        return Memory(LSTMState(*jnp.zeros((2, self.d_size))), note)
 
     def act(
         self, state: State, memory: Memory, step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]

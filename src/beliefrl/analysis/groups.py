@@ -125,16 +125,15 @@ def groups(
 ) -> list[Group]:
     """The runs' seeds, grouped; tasks and agents keep the order in which they first occur.
 
-    `defaults` are the default settings of each agent by name (`agents.defaults`), and `before` are values from before
-    a setting existed (`agents.before`). Both fill in settings that a run lacks because it is older than these settings,
-    first `before`. A setting with its default value is not shown in a label.
+    `defaults` are the default settings of each agent by name (`agents.defaults`). A setting with its default value is
+    not shown in a label. If a run is older than a setting, the setting has its value in `before` (`agents.before`), or
+    else its default.
 
     If a seed was trained several times with the same settings, only the run with the most steps counts, and among equal
     ones the latest: equal seed numbers give equal trainings, which must not count as several samples.
     """
     usual = {run.config["agent"]: (defaults or {}).get(run.config["agent"], {}) for run in runs}
-    older = {run.config["agent"]: (before or {}).get(run.config["agent"], {}) for run in runs}
-    filled = {agent: usual[agent] | older[agent] for agent in usual}
+    filled = {agent: usual[agent] | (before or {}).get(agent, {}) for agent in usual}
     settings = {run.folder: filled[run.config["agent"]] | run.config["hyperparameters"] for run in runs}
     seeds: dict[tuple[str, str], dict[int, Run]] = {}
     for run in runs:

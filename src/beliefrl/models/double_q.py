@@ -20,9 +20,9 @@ target with V̄(s), so it is biased where the policies differ.
 
 u is a running root mean square of y. The networks of the critics return Q / u. When u changes, their last layers are
 rescaled, so that Q stays the same (van Hasselt et al. 2016, without their mean). So one learning rate and one
-temperature fit tasks with returns of any size. With classes the last layers are not rescaled: Q changes with u, and
-learns its new size. Departure: y does not contain the entropy. Over a horizon of 200 steps
-the sum of entropies would exceed the rewards of most tasks. And because α is in units of u, u would influence itself.
+temperature fit tasks with returns of any size. With classes the last layers are not rescaled. So Q changes with u, and
+must learn the new scale. Departure: y does not contain the entropy. Over a horizon of 200 steps the sum of entropies
+would exceed the rewards of most tasks. And because α is in units of u, u would influence itself.
 """
 
 import math
@@ -44,6 +44,7 @@ from beliefrl.models.soft_actor_critic import (
     alpha_loss,
     q_outputs,
     soft_update,
+    squared_errors,
     valid_mean,
     wanted_entropy,
 )
@@ -143,9 +144,9 @@ def sample(
     return action, log_prob, policy
 
 
-def q_value(outputs: Float[Array, "batch output"]) -> Float[Array, " batch"]:
-    """Q / u, given all outputs of a critic."""
-    return outputs[:, 0] if outputs.shape[-1] == 1 else two_hot.value(outputs)
+def has_classes(critics: tuple[MLP, MLP]) -> bool:
+    """Whether the critics give logits (`two_hot`), and not Q / u."""
+    return len(critics[0].layers[-1].bias) > 1
 
 
 def q_low(
@@ -155,7 +156,8 @@ def q_low(
     pessimism: float,
 ) -> Float[Array, " batch"]:
     """Q_low(s, a)."""
-    one, two = (q_value(q_outputs(critic, belief, action)) for critic in critics)
+    outputs = (q_outputs(critic, belief, action) for critic in critics)
+    one, two = (two_hot.value(each) if has_classes(critics) else each[:, 0] for each in outputs)
     return jnp.minimum(one, two) + (1 - pessimism) / 2 * jnp.abs(one - two)
 
 
@@ -202,7 +204,7 @@ def rescale(
 ) -> DoubleQController:
     """The controller with u updated by the valid targets of one more batch, if there are any.
 
-    Q stays the same, but with classes Q / u does.
+    Q stays the same. With classes Q / u stays the same.
     """
     old, some = controller.unit, jnp.any(valid)
     rate = jnp.where(some, jnp.maximum(1 / (old.batches + 1), UNIT_RATE), 0.0)
@@ -216,7 +218,7 @@ def rescale(
     def by_ratio(leaf: Array) -> Array:
         return leaf * (old.u / new.u)
 
-    if len(controller.critics[0].layers[-1].bias) > 1:  # classes
+    if has_classes(controller.critics):
         return controller._replace(unit=new)
     critics, targets = tuple(map(rescaled, controller.critics)), tuple(map(rescaled, controller.targets))
     return controller._replace(critics=critics, targets=targets, unit=new)
@@ -224,12 +226,12 @@ def rescale(
 
 def q_loss(critics: tuple[MLP, MLP], batch: Samples, unit: Float[Array, ""]) -> Float[Array, ""]:
     """J_Q of both critics, summed."""
-
-    def error(critic: MLP) -> Float[Array, " batch"]:
-        outputs, y = q_outputs(critic, batch.belief, batch.action), batch.target / unit
-        return 0.5 * (outputs[:, 0] - y) ** 2 if outputs.shape[-1] == 1 else two_hot.cross_entropy(outputs, y)
-
-    return valid_mean(error(critics[0]) + error(critics[1]), batch.valid)
+    y = batch.target / unit
+    if not has_classes(critics):
+        return squared_errors(critics, batch.belief, batch.action, y, batch.valid)
+    outputs = (q_outputs(critic, batch.belief, batch.action) for critic in critics)
+    one, two = (two_hot.cross_entropy(logits, y) for logits in outputs)
+    return valid_mean(one + two, batch.valid)
 
 
 def actor_loss(

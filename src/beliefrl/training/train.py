@@ -229,7 +229,7 @@ def _check_possible(options: Options, task: Any, own_process: bool) -> None:
 def _check_same(run: Run, config: dict[str, Any], older: dict[str, Any]) -> None:
     """Raise a UserError if a run was trained with other settings than those of `config`, except CHANGEABLE options.
 
-    `older` are the values of hyperparameters from before they existed.
+    `older` are the values of hyperparameters that the run does not record (`hyperparameters.values_before`).
     """
     asked = {name: config.get(name) for name in ("agent", "task", "constants", "observe", "faults")}
     asked |= config["options"] | _with_functions_of(run.config["hyperparameters"], config["hyperparameters"])
