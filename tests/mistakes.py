@@ -254,6 +254,7 @@ MISTAKES = {
     "resume untrained --steps many": "--steps must be a whole number, not 'many'",
     "resume untrained --stop-at high": "--stop-at",
     "resume untrained --stop-at nan": "stop_at=nan is impossible",
+    "resume untrained --stop-patience 0": "stop_patience=0 is impossible: it must be a whole number of at least 1",
     "evaluate untrained --best": "untrained has no best agent yet: it is saved at the first evaluation",
     "export untrained policy.jax --best": "untrained has no best agent yet",
     "predict untrained --best": "untrained has no best agent yet",

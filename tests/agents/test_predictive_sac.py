@@ -239,8 +239,9 @@ def test_traces_use_the_policy_noted_at_their_timestep(state, begun):
     after, _, _ = jax.jit(agent.begin_cycle)(state, window, key)
     belief = jax.jit(agent.learn_model)(state, window)[1]
     valid, key = jnp.ones((6, 2), bool), jax.random.split(key)[0]
-    given = standardise(after.scales.belief, belief), window.step, valid, policy, key, agent.gamma, 0.8, 0.0, 0.25
-    y, _ = jax.jit(lambda: double_q.targets(state.controller, *given))()
+    given = standardise(after.scales.belief, belief), window.step, valid, policy, key
+    settings = {"gamma": agent.gamma, "decay": 0.8, "off_policy": 0.0, "pessimism": 0.25}
+    y, _ = jax.jit(lambda: double_q.critic_targets(state.controller, *given, **settings))()
     np.testing.assert_allclose(after.pool.transitions.target[0], y.ravel(), rtol=1e-4, atol=1e-5)
 
 

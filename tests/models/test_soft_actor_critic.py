@@ -238,7 +238,8 @@ def test_targets_mix_the_values_of_the_target_networks_by_how_likely_the_actions
     step = Timestep(belief, jax.random.normal(keys[2], (time, 2)), action, first, terminated)
     behaviour = Policy(*(0.5 * jax.random.normal(key, (time, 2, ACTION)) for key in keys[3:]))
     valid = jnp.ones((time - 1, 2), bool)
-    made = jax.jit(lambda: double_q.targets(controller, belief, step, valid, behaviour, key, 0.9, 0.8, 0.25, pessimism))
+    settings = {"gamma": 0.9, "decay": 0.8, "off_policy": 0.25, "pessimism": pessimism}
+    made = jax.jit(lambda: double_q.critic_targets(controller, belief, step, valid, behaviour, key, **settings))
     y, like = map(np.asarray, made())
 
     flat = np.asarray(belief).reshape(-1, BELIEF)
@@ -330,7 +331,8 @@ def test_what_is_learned_does_not_depend_on_the_size_of_rewards(size):
         state = init_optimisers(optimisers, controller)
         for number in range(5):
             key = jax.random.key(number)
-            controller, state, _ = double_q.update(optimisers, state, controller, data, key, 0.1, 1e-3, 1.0)
+            settings = {"tau": 0.1, "regulariser": 1e-3, "pessimism": 1.0}
+            controller, state, _ = double_q.update(optimisers, state, controller, data, key, **settings)
         return controller
 
     plain = make()._replace(unit=Unit(jnp.array(25.0), jnp.array(1e6)))
@@ -349,9 +351,8 @@ def test_an_update_moves_the_targets_by_tau_and_ignores_what_is_not_valid():
 
     @jax.jit
     def update(data):
-        return double_q.update(
-            optimisers, init_optimisers(optimisers, controller), controller, data, KEY, 0.25, 1e-3, 1.0
-        )[0]
+        state, settings = init_optimisers(optimisers, controller), {"tau": 0.25, "regulariser": 1e-3, "pessimism": 1.0}
+        return double_q.update(optimisers, state, controller, data, KEY, **settings)[0]
 
     after, same = update(data), update(other)
     for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(same), strict=True):

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
+from beliefrl.agents import Metrics
 from beliefrl.agents.hyperparameters import Range
 from beliefrl.models.nets import RunningStatistics, standardise, tanh_gaussian, update_statistics
 from beliefrl.models.returns import transition_batch
@@ -27,7 +28,6 @@ from beliefrl.models.soft_actor_critic import (
 from beliefrl.types import LARGEST, WIDEST, Window, WindowShape, check_choice, check_range, transitions
 
 MOST_STEPS = 64  # of an n-step return; each step is compiled
-Metrics = dict[str, Float[Array, ""]]
 
 
 @dataclasses.dataclass(frozen=True)

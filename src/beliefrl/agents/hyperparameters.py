@@ -83,7 +83,7 @@ def restored(agent: Any, recorded: Mapping[str, Any]) -> Any:
     """An agent like this one, or of this class, with hyperparameters that were recorded as JSON.
 
     JSON cannot represent some values, such as functions. For these the agent keeps its own values. A hyperparameter
-    that the record lacks has its value in `values_before`, or else its default.
+    that the record lacks has its value in `values_before`, or else that of the given agent (of a class: its default).
 
     Raises:
         UserError: as `build`.

@@ -30,7 +30,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents.base import ControllerAgent, Metrics, Range
+from beliefrl.agents import Metrics
+from beliefrl.agents.base import ControllerAgent, Range
 from beliefrl.models import average, double_q, pool, reading
 from beliefrl.models.average import Average
 from beliefrl.models.double_q import DoubleQController, Policy, Samples
@@ -45,7 +46,7 @@ from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_ra
 class Note(NamedTuple):
     """What the replay stores with a timestep.
 
-    After the pre-training all notes are made anew. So in the exploration b is the untrained policy on the new beliefs.
+    After the pre-training all notes are made anew: for the exploration b is the untrained policy on the new beliefs.
     """
 
     rewards: Float[Array, "*batch constants"]  # m_t, in units of the reward
@@ -84,11 +85,11 @@ class PredictiveSACAgent(ControllerAgent):
     pessimism: float = 1.0
     """P, in [0, 1]. The actor and the targets use the smaller Q (1), the mean of the two (0), or a mixture."""
     train_interval_rl: int = 1
-    """Environment steps between two updates of the model."""
+    """Environment steps between two updates of the model. Unlike in `vrm`, the controller learns at each step."""
     updates_per_step: int = 1
-    """Updates of the controller for each environment step. With more, a step takes longer."""
+    """Updates of the controller for each environment step, also if the model learns less often."""
     batch_size: int = 128
-    """Transitions in an update of the controller."""
+    """Transitions in an update of the controller. Those that are not valid do not count."""
     lr_actor: float = 1e-3
     """Adam's learning rate for the actor."""
     lr_critic: float = 1e-3
@@ -96,7 +97,7 @@ class PredictiveSACAgent(ControllerAgent):
     lr_alpha: float = 2e-3
     """Adam's learning rate for log α, the temperature."""
     alpha_start: float = 0.1
-    """α before training, in units of the returns."""
+    """α before training, in units of u, the size of the returns."""
     tau: float = 0.02
     """Soft-update rate of the target Qs, in [0, 1]."""
     policy_layers: tuple[int, ...] = (128, 128)
@@ -133,15 +134,15 @@ class PredictiveSACAgent(ControllerAgent):
     long_memories: float = 0.25
     """Fraction of the LSTM's cells that start with a long memory, in [0, 1]."""
     longest_memory: int = 127
-    """Steps over which the slowest of these cells forgets at the start of the training."""
+    """The forget biases of these cells are log U(1, this): time constants of 2 to this + 1 steps at the start."""
     reward_memory: tuple[float, ...] = (8.0, 64.0, 512.0)
     """Time constants, in steps, of the memory of unusual rewards that the LSTM reads. The pre-training determines which
     rewards are unusual."""
     pool: int = 8
-    """Number of the last cycles whose transitions are in the pool."""
+    """Number of the last cycles whose transitions are in the pool. There are `pool` × `sequences` readers."""
     average_rate: float = 2e-4
-    """Smallest rate of the running average of the weights that is evaluated and saved, in (0, 1]. After n updates the
-    rate is at least 10 / (n + 9). With 1, the newest weights are evaluated."""
+    """Smallest rate of the running average of the weights that is evaluated and saved, in (0, 1]. After n updates of
+    the controller the rate is at least 10 / (n + 9). With 1, the newest weights are evaluated."""
 
     ranges = ControllerAgent.ranges | {
         "updates_per_step": (1, 2, 4),
@@ -213,14 +214,13 @@ class PredictiveSACAgent(ControllerAgent):
         )
 
     def networks(self, state: State) -> State:
-        """The state with the averages in place of the newest weights, without what only updates need.
+        """The averages in place of the newest weights, the newest scales, and the Q networks (for `--init-from`).
 
         Before the first update there are no averages, and the newest weights stay.
         """
         model, actor = average.averaged(state.average, (state.model, state.controller.actor))
-        only_for_updates = ("readers", "pool", "model_optimiser", "controller_optimiser", "average")
-        controller = state.controller._replace(actor=actor)
-        return state._replace(model=model, controller=controller, **dict.fromkeys(only_for_updates, ()))
+        rest = ("readers", "pool", "model_optimiser", "controller_optimiser", "average")
+        return state._replace(model=model, controller=state.controller._replace(actor=actor), **dict.fromkeys(rest, ()))
 
     # Acting
 
@@ -288,13 +288,13 @@ class PredictiveSACAgent(ControllerAgent):
         """The transitions of windows with their targets; also the mean of min(1, π / b)."""
         valid, s = reading.known_transitions(windows), standardise(state.scales.belief, belief)
         step, b = windows.step, windows.note.policy
-        settings = self.gamma, self.trace_decay, self.off_policy_trace, self.pessimism
-        y, likeness = double_q.targets(state.controller, s, step, valid, b, key, *settings)
+        settings = {"decay": self.trace_decay, "off_policy": self.off_policy_trace, "pessimism": self.pessimism}
+        y, likeness = double_q.critic_targets(state.controller, s, step, valid, b, key, gamma=self.gamma, **settings)
         return Samples(belief[:-1], step.prev_action[1:], y, valid), valid_mean(likeness.ravel(), valid.ravel())
 
     def update(self, state: State, batch: Samples, key: Key[Array, ""]) -> tuple[State, Metrics]:
-        given = state.controller_optimiser, state.controller, batch, key
-        settings = self.tau, self.actor_regulariser, self.pessimism, self.target_entropy
-        controller, optimiser, metrics = double_q.update(self.optimisers, *given, *settings)
+        given = self.optimisers, state.controller_optimiser, state.controller, batch, key
+        settings = {"tau": self.tau, "regulariser": self.actor_regulariser, "pessimism": self.pessimism}
+        controller, optimiser, metrics = double_q.update(*given, **settings, target_entropy=self.target_entropy)
         followed = average.follow(state.average, (state.model, controller.actor), self.average_rate)
         return state._replace(controller=controller, controller_optimiser=optimiser, average=followed), metrics

@@ -17,7 +17,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents.base import Metrics, Range, SACAgent, for_each_update, split_updates
+from beliefrl.agents import Metrics
+from beliefrl.agents.base import Range, SACAgent, for_each_update, split_updates
 from beliefrl.models.nets import LSTM, LSTMState, descend, draw
 from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState, soft_update, update
 from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range

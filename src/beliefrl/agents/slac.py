@@ -18,7 +18,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents.base import Metrics, Range, SACAgent, split_updates
+from beliefrl.agents import Metrics
+from beliefrl.agents.base import Range, SACAgent, split_updates
 from beliefrl.models.latent_model import LatentModel, Latents, elbo_terms, predict
 from beliefrl.models.nets import Gaussian, descend, draw
 from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean

@@ -8,7 +8,8 @@ both models are deterministic.
 
 Departures:
 1. The first-impression model's d_t is computed once, when the timestep is perceived, and stored in the replay
-   (`store_first_impression`). The model does not change any more, so the only difference is that z is not sampled anew.
+   (`store_first_impression`). The model does not change any more. So there are two differences: z is not sampled anew,
+   and d_t summarises the whole episode, and not only the burn-in and what follows.
 2. All updates of a cycle of `train_interval_klvrm` steps are made at its end: first one of the keep-learning model,
    then those of the controller. The model does not change between the latter, so one unroll gives all their beliefs.
 3. If the agent does not explore, z is the posterior's mean, so that a mode action also has a belief without noise.
@@ -22,7 +23,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents.base import Metrics, Range, SACAgent, split_updates, standardise_beliefs
+from beliefrl.agents import Metrics
+from beliefrl.agents.base import Range, SACAgent, split_updates, standardise_beliefs
 from beliefrl.models.nets import Gaussian, LSTMState, RunningStatistics, descend, draw, initial_statistics, standardise
 from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState
 from beliefrl.models.variational_model import VRM, predict

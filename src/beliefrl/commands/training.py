@@ -52,6 +52,8 @@ class ResumeOptions:
     """Total number of environment steps of each seed, at least as many as before. None: as many as before."""
     stop_at: NewLimit = "same"
     """Return at which the training ends, as in `beliefrl train`. None: train for all steps. same: as before."""
+    stop_patience: int | None = None
+    """Number of evaluations for --stop-at, as in `beliefrl train`. None: as before."""
     step_timeout: NewLimit = "same"
     """Maximum number of seconds of a step, as in `beliefrl train`. None: no limit. same: as before."""
     agent: OwnAgent = None
@@ -134,4 +136,5 @@ def resume(argv: Sequence[str]) -> None:
         own_process=True,
         stop_at=options.stop_at,
         step_timeout=options.step_timeout,
+        stop_patience=options.stop_patience,
     )

@@ -122,8 +122,8 @@ def init_controller(
     policy_layers: tuple[int, ...],
     value_layers: tuple[int, ...],
     alpha: float,
-    normalise_critics: bool = False,
-    classes: int = 1,
+    normalise_critics: bool,
+    classes: int,
 ) -> DoubleQController:
     """A new controller for beliefs and actions of these sizes; Q̄ starts as Q, α at `alpha`, u at 1.
 
@@ -162,19 +162,23 @@ def q_low(
 
 
 def likeness(policy: Policy, behaviour: Policy, action: Float[Array, "*batch action"]) -> Float[Array, "*batch"]:
-    """min(1, π(a|s) / b(a|s)), from the densities before the tanh, because its derivative cancels."""
+    """min(1, π(a|s) / b(a|s)), from the densities before the tanh, because its derivative cancels.
+
+    a is taken as at most `ACTION_MAX`. So the ratio is not exact if a policy has |μ| over 7.
+    """
     before = jnp.arctanh(jnp.clip(action, -ACTION_MAX, ACTION_MAX))
     pi, b = (gaussian_log_prob(before, each.mean, jnp.exp(each.log_sigma)) for each in (policy, behaviour))
     return jnp.exp(jnp.minimum(jnp.sum(pi - b, axis=-1), 0.0))
 
 
-def targets(
+def critic_targets(
     controller: DoubleQController,
     belief: Float[Array, "time batch belief"],
     step: Timestep,
     valid: Bool[Array, "length batch"],
     behaviour: Policy,
     key: Key[Array, ""],
+    *,
     gamma: float,
     decay: float,
     off_policy: float,
@@ -185,7 +189,7 @@ def targets(
     Args:
         controller: its actor is π.
         belief, step: at the timesteps.
-        valid: as for `n_step_returns`.
+        valid: which pairs of neighbours are transitions. For the others y_t has no meaning.
         behaviour: b(a|s_t) at the timesteps.
         key: the randomness of ã.
         gamma, decay, off_policy, pessimism: γ, λ, ω and P.
@@ -204,7 +208,7 @@ def rescale(
 ) -> DoubleQController:
     """The controller with u updated by the valid targets of one more batch, if there are any.
 
-    Q stays the same. With classes Q / u stays the same.
+    Q stays the same. With classes Q / u stays the same. Departure: Adam's moments are not rescaled.
     """
     old, some = controller.unit, jnp.any(valid)
     rate = jnp.where(some, jnp.maximum(1 / (old.batches + 1), UNIT_RATE), 0.0)
@@ -255,6 +259,7 @@ def update(
     controller: DoubleQController,
     batch: Samples,
     key: Key[Array, ""],
+    *,
     tau: float,
     regulariser: float,
     pessimism: float,

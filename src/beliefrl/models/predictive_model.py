@@ -10,14 +10,16 @@ with one entry for each time constant T:
     J_model              = E ‖prediction - (o_{t+1}, r_t)‖²,  mean over the entries
 
 To predict, h_t must contain the information of the history about the hidden state. Some cells start with a long
-memory: the biases of their forget gates are log U(1, T), so that they forget over up to T steps (Tallec and Ollivier
-2018, "chrono initialisation"). An LSTM with the usual initialisation forgets an event within some tens of steps.
-Predictions one step ahead do not train it to remember longer.
+memory: the biases of their forget gates are log U(1, T), so their time constants are 2 to T + 1 steps (Tallec and
+Ollivier 2018, "chrono initialisation", but with the usual biases of the input gates). An LSTM with the usual biases
+forgets an event within some tens of steps. Predictions one step ahead do not train it to remember longer.
 
 The memory m_t needs no learning. The replay stores it, so a window that begins in the middle of an episode has the
-memory of the whole episode. r̄ and δ are the median and the mean absolute deviation of the rewards of the exploration.
-They do not change afterwards, so m_t has one meaning in the whole replay. m_t has no usual rewards, for two reasons. If
-all rewards are equal, m_t would only tell the time. If they vary at every step, m_t might only identify the episode.
+memory of the whole episode. r̄ and δ are the median and the mean absolute deviation of the rewards of the exploration:
+averages over the batches of the pre-training. They do not change afterwards, so m_t has one meaning in the whole
+replay. m_t has no usual rewards, for two reasons. If all rewards are equal, m_t would only tell the time. If they vary
+at every step, m_t might only identify the episode. But where a better policy has other rewards at most steps than the
+exploration had, they all count as unusual. Then m_t / σ_r can stay at its limit, and tells nothing.
 """
 
 from typing import NamedTuple
@@ -95,7 +97,7 @@ def init_model(
     long_memories: float,
     longest_memory: int,
 ) -> PredictiveModel:
-    """A new model. A fraction `long_memories` of its cells forgets over 1 to `longest_memory` steps."""
+    """A new model. A fraction `long_memories` of its cells have forget biases log U(1, `longest_memory`)."""
     key_weights, key_memories = jax.random.split(key)
     model = draw(key_weights, PredictiveModel(obs, action, memories, d, hidden))
     cells = round(long_memories * d)

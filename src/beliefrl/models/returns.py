@@ -97,7 +97,7 @@ def lambda_returns(
 
     Args:
         step: the timesteps.
-        valid: as for `n_step_returns`.
+        valid: which pairs of neighbours are transitions. For the others y_t has no meaning.
         value: V̄(s_t) at every timestep.
         trace: c_t; only those of valid transitions are used.
         gamma: γ.

@@ -8,8 +8,8 @@ The step counter is not mapped over seeds. Each phase is a compiled function of 
 steps. The number of steps is an argument, so each phase is compiled once, and no result depends on the length of the
 blocks. Random keys are derived from the seed's key and the number of the step. `schedule` calls the phases.
 
-The loops over steps, updates and cycles are outside what is mapped over seeds: JAX traces the body of a loop that is
-mapped three times, and that of a loop over a mapped body once.
+The outermost loop of a phase (over steps, updates or rounds) is not mapped over seeds. Its body is. JAX then traces
+the body once. If the loop itself were mapped, JAX would trace it three times.
 
 A seed may have several environments, `envs`, each with an actor and a ring of the replay of its own: the actors' and
 the replay's leaves then have an axis `env`. All environments step together, and steps are counted over all of them.

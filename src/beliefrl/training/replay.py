@@ -79,9 +79,10 @@ def read(
 ) -> tuple[Window, Readers]:
     """The windows of the next `batch` readers, leaves (time, batch, ...), and the readers after these windows.
 
-    A reader continues where its last window ended. The last timestep of a window is the first of the next one, so
-    every transition is in one of them. With the probability `shape.jump` the reader jumps to a random place, from which
-    two windows are stored if a ring has so many. It must jump if its next window is not complete, or was overwritten.
+    A reader continues where its last window ended. The last timestep of a window is the first of the next one, so no
+    transition between two windows is left out. With the probability `shape.jump` the reader jumps to a random place,
+    from which two windows are stored if a ring has so many. It must jump if its next window is not complete, or was
+    overwritten. So the oldest and the newest timesteps of a ring are read less often than the others.
 
     Raises:
         UserError: there are fewer readers than windows to read.

@@ -1,7 +1,7 @@
 """Training from the first step to the last, on the host: the order of the phases.
 
 The loop is Python over compiled blocks, called stretches (`phases`). A compiled function never calls back. `stages`
-yields events, and `train` records them in a run's folder.
+yields events, and `session` records them in a run's folder.
 """
 
 import enum

@@ -104,6 +104,7 @@ def resume(
     callback: Callback | None = None,
     stop_at: float | Literal["same"] | None = "same",
     step_timeout: float | Literal["same"] | None = "same",
+    stop_patience: int | None = None,
 ) -> Run:
     """Continue a training from its last checkpoint.
 
@@ -120,14 +121,17 @@ def resume(
         stop_at: the option `stop_at` from now on; None: train for all steps; "same": as before. A training that has
             reached its `stop_at` is finished, and continues only with a higher one or None.
         step_timeout: the option `step_timeout` from now on; None: no limit; "same": as before.
+        stop_patience: the option `stop_patience` from now on; None: as before.
 
     Raises:
         UserError: there is no such run, it has no undamaged checkpoint, another process trains it, or `steps` is too
             small.
         Stopped: Ctrl-C or SIGTERM, after a checkpoint is written.
     """
-    given = {"steps": "same" if steps is None else steps, "stop_at": stop_at, "step_timeout": step_timeout}
-    changes = {name: value for name, value in given.items() if value != "same"}
+    limits = {"stop_at": stop_at, "step_timeout": step_timeout}
+    numbers = {"steps": steps, "stop_patience": stop_patience}
+    changes: dict[str, Any] = {name: value for name, value in limits.items() if value != "same"}
+    changes |= {name: value for name, value in numbers.items() if value is not None}
     run = run if isinstance(run, Run) else Run(run)
     return _go_on(run, changes, task, (report, callback), agent, own_process, progress)
 
