@@ -284,7 +284,7 @@ MISTAKES = {
     "report untrained --out missing/page.html": "no folder missing",
     "report untrained -o": "-o/--out needs a value",
     "report untrained --unfinshed": "did you mean --unfinished?",
-    "evaluate unknown": "unknown was trained on nowhere, which is not a task of this library",
+    "evaluate unknown": "unknown was trained on nowhere, which has no registered name: in Python, give it with task=.",
     "evaluate overset": "has no hyperparameter 'colour'",
     "evaluate faulty": "There is no fault 'colour'",
     "evaluate masked": "give indices from 0 to 0",

@@ -48,6 +48,9 @@ and exit code 2.
 """
 
 
+KEEPING = ("train", "resume", "sweep", "tune")  # the commands that save something when they are stopped
+
+
 def _fail(message: str) -> NoReturn:
     print("beliefrl:", " ".join(message.split()), file=sys.stderr)
     raise SystemExit(2)
@@ -78,7 +81,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     except (UsageError, UserError) as error:
         _fail(one_line(str(error)))
     except KeyboardInterrupt as stopped:
-        what = str(stopped) or "stopped; what was logged and saved stays in the run's folder."
+        kept = " What was logged and saved stays in the folder of the run." if argv[0] in KEEPING else ""
+        what = str(stopped) or f"stopped.{kept}"
         print(f"beliefrl: {what}", file=sys.stderr)
         raise SystemExit(getattr(stopped, "exit_code", 130)) from None
     except BrokenPipeError:

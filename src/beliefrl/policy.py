@@ -244,12 +244,14 @@ def _numbers(value: Any, name: str) -> np.ndarray:
     Raises:
         UserError: an entry is not a number.
     """
+    if isinstance(value, dict):
+        raise UserError(f"{name} is a dictionary: give one flat array, with the entries that the agent observes.")
     array = as_array(value)
     for index, entry in np.ndenumerate(array if array.dtype == object else ()):
         if not isinstance(entry, Real):
             raise UserError(f"{_place(name, index)} is {short(entry)}: give finite numbers.")
     if array.dtype.kind not in "iuf":
-        raise UserError(f"{name} must be real numbers, not {short(value)}.")
+        raise UserError(f"{name} must be real numbers, not {short(value)}: the arguments are obs, reward, state.")
     return array
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -10,11 +11,13 @@ import pytest
 
 from beliefrl import tasks
 from beliefrl.tasks import TASKS, entry_names, make, names, observe
+from beliefrl.tasks.given import given
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.pendulum import Pendulum
 from beliefrl.tasks.target_reaching import TargetReaching
 from beliefrl.types import UserError
 from worlds import Counter, Counting, installed
+from wrong import Fine
 
 SIZES = {  # obs_dim, action_dim, max_steps, measures
     "pendulum": (3, 1, 200, ()),
@@ -264,3 +267,29 @@ def test_entry_points_are_not_read_for_what_is_ours(monkeypatch):
     for name in ("pendulum-v", "target-reaching"):
         assert tasks.knows(name)
         assert tasks.describe(tasks.make(name))["task"] == name
+
+
+def test_a_class_of_environments_is_a_task():
+    task = given(Fine)
+    assert (task.make, task.name) == (Fine, "Fine")
+    assert given("pendulum-v") == tasks.make("pendulum-v")
+    assert given(task) is task
+
+
+@pytest.mark.parametrize(
+    ("wrong", "phrase"),
+    [
+        (Fine(), "Fine is given as one environment, but several are needed: give its class"),
+        (Pendulum, "is no task: give the name of a task, a task, or a class of Gymnasium environments"),
+        (None, "None is no task"),
+    ],
+)
+def test_what_is_no_task_is_refused(wrong, phrase):
+    with pytest.raises(UserError, match=phrase):
+        given(wrong)
+
+
+@pytest.mark.parametrize("make", [Fine(), "gym:Pendulum-v1"])
+def test_a_gymnasium_task_needs_something_that_makes_environments(make):
+    with pytest.raises(UserError, match="GymnasiumTask needs a class or function that makes environments, not"):
+        GymnasiumTask.__post_init__(SimpleNamespace(make=make))  # the constructor's types are checked in tests

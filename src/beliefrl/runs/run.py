@@ -31,7 +31,7 @@ from beliefrl.runs.folder import locked, make, write_config
 from beliefrl.runs.options import Options
 from beliefrl.runs.records import Row, now
 from beliefrl.runs.trackers import Tracker
-from beliefrl.types import UserError, cause, tuples
+from beliefrl.types import UserError, cause, one_line, tuples
 
 
 class Run:
@@ -67,6 +67,11 @@ class Run:
         known = {field.name for field in dataclasses.fields(Options)}
         given = tuples(self.config["options"])
         return Options(**{name: value for name, value in given.items() if name in known})
+
+    def __repr__(self) -> str:
+        """The folder, the agent and the task: `<Run runs/first: vrm on pendulum-v>`."""
+        agent, task = one_line(str(self.config["agent"])), one_line(str(self.config["task"]))
+        return f"<Run {self.folder}: {agent} on {task}>"
 
     @property
     def seeds(self) -> list[int]:

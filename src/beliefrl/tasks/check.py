@@ -14,6 +14,7 @@ from rich.text import Text
 
 from beliefrl import tasks
 from beliefrl.tasks.environment import TaskEnvironment
+from beliefrl.tasks.given import given
 from beliefrl.tasks.gymnasium import ENDLESS, GymnasiumTask
 from beliefrl.tasks.spaces import action_names, check_actions, flat_bounds, flat_size, observation_names
 from beliefrl.types import LARGEST, UserError, check_whole, short
@@ -104,7 +105,7 @@ def check(
     Actions are uniform between the bounds of the environment.
 
     Args:
-        task: the name of a task, as for `make_task`, or a task.
+        task: the name of a task, as for `make_task`, a task, or a class of Gymnasium environments.
         observe: entries that the agent will observe, as for `make_task`; None: all, or those of the task.
         steps: number of random steps, at least 1.
         seed: random seed of the steps, at least 0.
@@ -115,7 +116,7 @@ def check(
     """
     check_whole("steps", steps, 1)
     check_whole("seed", seed, 0, LARGEST // 2)  # each episode has one more
-    whole = tasks.make(task, **constants) if isinstance(task, str) else task
+    whole = tasks.make(task, **constants) if isinstance(task, str) else given(task)
     found = _declared(whole)
     if found.refusals:
         return found

@@ -50,7 +50,9 @@ class GymnasiumTask:
     """Missing and faulty sensors."""
 
     def __post_init__(self) -> None:
-        """Set the default name. Raise a UserError for an impossible time limit."""
+        """Set the default name. Raise a UserError for an impossible time limit, or if `make` makes no environments."""
+        if not callable(self.make):
+            raise UserError(f"GymnasiumTask needs a class or function that makes environments, not {short(self.make)}.")
         if self.max_steps is not None:
             check_range(self, ("max_steps",), 1)
         if not self.name:
@@ -284,8 +286,7 @@ class FaultyEnvironment(Environment):
         return seen
 
     def _draws(self) -> Draws:
-        size = self.indices.size
-        normal, uniform = self._random.standard_normal, self._random.random
+        size, normal, uniform = self.indices.size, self._random.standard_normal, self._random.random
         return Draws(normal(size, np.float32), uniform(size, np.float32), uniform(), uniform())
 
 

@@ -96,7 +96,8 @@ def _missing(id: str, found: Exception) -> str:
     known = KNOWN.get(id)
     if known and known.extra:
         return f"{PREFIX}{id} needs packages that are not installed: pip install 'beliefrl[{known.extra}]'."
-    return f"{PREFIX}{id} needs something that is not installed ({_first_sentence(found)}): install it with pip."
+    lacks = _first_sentence(found)
+    return f"{PREFIX}{id} needs something that is not installed ({lacks}): install it with pip, or start in its folder."
 
 
 def _first_sentence(found: Exception) -> str:

@@ -15,6 +15,7 @@ from beliefrl.imports import path
 from beliefrl.runs.options import MOST_EPISODES
 from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
+from beliefrl.tasks.given import given
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.compilation import keep_compiled
 from beliefrl.training.host_evaluation import Evaluation
@@ -61,11 +62,15 @@ def restore(
         UserError: the run's agent or task is unknown here, or nothing was saved.
     """
     made = agent_of(run, agent)
-    found = task_of(run) if task is None else task
+    found = task_of(run) if task is None else task_like(run, task)
     spec = found.spec
     keys = jax.random.split(jax.random.key(0), len(run.seeds))
     like = jax.eval_shape(jax.vmap(lambda key: made.networks(made.init(key, spec))), keys)
-    return made, found, run.load(like, best), run.precision
+    try:
+        return made, found, run.load(like, best), run.precision
+    except UserError as error:
+        hint = "" if task is None else " Or the given task is not that of the training."
+        raise UserError(f"{error}{hint}") from None
 
 
 def restore_seed(
@@ -128,9 +133,32 @@ def task_of(run: Run | str | os.PathLike[str]) -> Any:
     run = run if isinstance(run, Run) else Run(run)
     name, constants = run.config["task"], tuples(run.config["constants"])
     if not tasks.knows(name):
-        raise UserError(f"{run.folder} was trained on {name}, which is not a task of this library: pass task=.")
+        raise UserError(
+            f"{run.folder} was trained on {name}, which has no registered name: in Python, give it with task=. The "
+            "command line needs a registered name."
+        )
     with _naming(run):
         return tasks.make(name, **constants | {each: run.config.get(each) for each in ("observe", "faults")})
+
+
+def task_like(run: Run, task: Any) -> Any:
+    """A task that a user gives for a run, after a check that the agent observes the entries that it was trained with.
+
+    Raises:
+        UserError: it is no task, or other entries are observed.
+    """
+    made, observed = given(task), run.config.get("observe")
+    now = tasks.describe(made)["observe"]
+    if now != observed:
+        raise UserError(
+            f"{run.folder} was trained on {_entries(observed)} of the observation, and the given task shows "
+            f"{_entries(now)}: give the same."
+        )
+    return made
+
+
+def _entries(observed: list[int] | None) -> str:
+    return "all entries" if observed is None else f"the entries {' '.join(map(str, observed))}"
 
 
 @contextlib.contextmanager

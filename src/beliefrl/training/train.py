@@ -15,9 +15,10 @@ from beliefrl.runs.folder import free_folder
 from beliefrl.runs.records import provenance
 from beliefrl.runs.run import Recorder, Run
 from beliefrl.tasks import Task
+from beliefrl.tasks.given import given
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import initial
-from beliefrl.training.evaluation import agent_of, task_of
+from beliefrl.training.evaluation import agent_of, task_like, task_of
 from beliefrl.training.schedule import Event, Options, capacity
 from beliefrl.training.session import Callback, Session
 from beliefrl.types import UserError, tuples
@@ -27,7 +28,7 @@ CHANGEABLE = ("steps", "stop_at", "stop_patience", "step_timeout")  # options th
 
 def train(
     agent: Agent | str,
-    task: Task | GymnasiumTask | str,
+    task: Task | GymnasiumTask | str | type,
     out: str | os.PathLike[str] | None = None,
     report: Callback | None = None,
     own_process: bool = False,
@@ -40,7 +41,7 @@ def train(
 
     Args:
         agent: an agent, or the name of one with its default hyperparameters (`make_agent`).
-        task: a task, or the name of one.
+        task: a task, the name of one, or a class of Gymnasium environments.
         out: the run's folder; None is runs/AGENT-TASK-1, or the next free number. It must not exist, unless it is empty
             or a training left it that ended before it saved an agent or a checkpoint. Such a folder is used again.
         report: called with every Event when it happens; its return value is ignored.
@@ -69,7 +70,7 @@ def train(
         Stopped: Ctrl-C or SIGTERM, after a checkpoint is written; `resume` continues. It is a KeyboardInterrupt.
     """
     agent = agents.make(agent) if isinstance(agent, str) else agent
-    made: Any = tasks.make(task) if isinstance(task, str) else task
+    made: Any = given(task)
     chosen = _chosen(options)
     _ = capacity(agent, chosen), made.spec  # raise before the folder is made
     _check_possible(chosen, made, own_process)
@@ -96,7 +97,7 @@ def train(
 def resume(
     run: Run | str | os.PathLike[str],
     steps: int | None = None,
-    task: Task | GymnasiumTask | None = None,
+    task: Task | GymnasiumTask | type | None = None,
     report: Callback | None = None,
     agent: Agent | type | None = None,
     own_process: bool = False,
@@ -153,7 +154,7 @@ def _go_on(
     _ = Options(**_options(run) | changes)  # raise before the folder is locked
     with contextlib.ExitStack() as showing, contextlib.ExitStack() as stack:
         recorder = stack.enter_context(Recorder(folder, None))
-        made = task_of(recorder) if task is None else task
+        made = task_of(recorder) if task is None else task_like(recorder, task)
         before = _options(recorder)
         steps = changes.get("steps", before["steps"])
         if steps < before["steps"]:
@@ -208,7 +209,10 @@ def _chosen(options: dict[str, Any]) -> Options:
     known = [field.name for field in dataclasses.fields(Options)]
     for name in options:
         if name not in known:
-            raise UserError(f"Training has no option {name!r}: it has {', '.join(known)}.")
+            raise UserError(
+                f"Training has no option {name!r}: it has {', '.join(known)}. Hyperparameters are given to make_agent, "
+                "and what is observed to make_task."
+            )
     source = options.get("init_from")
     path = source.folder if isinstance(source, Run) else source
     chosen: dict[str, Any] = options | {"init_from": str(path) if isinstance(path, os.PathLike) else path}
