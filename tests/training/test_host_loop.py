@@ -206,7 +206,7 @@ def test_what_was_learned_before_a_fault_is_kept(tmp_path):
         assert [row["length"] for row in run.rows(seed, "episode")] == [10, 10]
         assert [row["step"] for row in run.rows(seed, "update")][-1] == 26  # as far as it came
     action, _ = load(run, task=Fine).predict(np.zeros(2))
-    with pytest.raises(UserError, match="on all entries of the observation, and the given task shows the entries 1 0"):
+    with pytest.raises(UserError, match="on all entries of the observation, and the given task shows entries 1 0"):
         load(run, task=GymnasiumTask(Fine, indices=(1, 0)))
     assert np.all(np.abs(action) <= 1)
 

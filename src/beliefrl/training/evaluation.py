@@ -158,7 +158,7 @@ def task_like(run: Run, task: Any) -> Any:
 
 
 def _entries(observed: list[int] | None) -> str:
-    return "all entries" if observed is None else f"the entries {' '.join(map(str, observed))}"
+    return "all entries" if observed is None else f"entries {' '.join(map(str, observed))}"
 
 
 @contextlib.contextmanager
