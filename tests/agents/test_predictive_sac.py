@@ -135,6 +135,18 @@ def test_a_belief_in_the_replay_remembers_rewards_from_before_its_window(state):
     np.testing.assert_allclose(plain[..., d:], other[..., d:], rtol=1e-5)  # x_t has no memory
 
 
+def test_without_time_constants_there_is_no_memory_of_rewards():
+    agent = dataclasses.replace(AGENT, reward_memory=())
+    state = jax.jit(lambda key: agent.init(key, SPEC))(jax.random.key(0))
+    window = noted(windows(jax.random.key(1), 1, TIME))
+    window = window._replace(note=window.note._replace(rewards=jnp.zeros((TIME, 1, 0))))
+    step = jax.tree.map(lambda leaf: leaf[0, 0], window.step)
+    _, memory = jax.jit(agent.act)(state, agent.reset(SPEC), step, jax.random.key(2), jnp.array(False))
+    d = unrolled(state, window).d[0, 0]
+    np.testing.assert_allclose(memory.lstm.d, d, rtol=1e-5, atol=1e-6)
+    assert agent.note(memory).rewards.shape == (0,)
+
+
 def test_equal_rewards_tell_no_time(state):
     """Where all rewards are alike, as on CartPole, the memory stays empty; so it does before the pre-training."""
     step = jax.tree.map(lambda leaf: leaf[0, 0], windows(jax.random.key(1), 1, TIME).step)

@@ -137,7 +137,7 @@ class PredictiveSACAgent(ControllerAgent):
     """The forget biases of these cells are log U(1, this): time constants of 2 to this + 1 steps at the start."""
     reward_memory: tuple[float, ...] = (8.0, 64.0, 512.0)
     """Time constants, in steps, of the memory of unusual rewards that the LSTM reads. The pre-training determines which
-    rewards are unusual."""
+    rewards are unusual. Without any, there is no memory of rewards."""
     pool: int = 8
     """Number of the last cycles whose transitions are in the pool. There are `pool` × `sequences` readers."""
     average_rate: float = 2e-4
@@ -171,7 +171,7 @@ class PredictiveSACAgent(ControllerAgent):
         check_range(self, ("lr_model", "lr_model_min", "jump"), 0, 1)
         check_range(self, ("long_memories", "trace_decay", "off_policy_trace", "pessimism"), 0, 1)
         check_range(self, ("average_rate",), 1e-6, 1)
-        check_range(self, ("reward_memory", "longest_memory"), 1)
+        check_range(self, ("longest_memory", "reward_memory") if self.reward_memory else ("longest_memory",), 1)
 
     # How it is trained
 
