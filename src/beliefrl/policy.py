@@ -215,7 +215,7 @@ class Policy:
 def load(
     run: Run | str | os.PathLike[str],
     seed: int | None = None,
-    task: Task | GymnasiumTask | None = None,
+    task: Task | GymnasiumTask | type | None = None,
     agent: Agent | type | None = None,
     best: bool = False,
 ) -> Policy:
@@ -224,7 +224,7 @@ def load(
     Args:
         run: a run, or its folder.
         seed: one of the run's seeds; None: its first.
-        task: needed only if the run was trained on a task of your own.
+        task: needed only if the run was trained on a task of your own: that task, or its class of environments.
         agent: needed only if the run was trained by an agent of your own: its class, or an instance.
         best: take the seed's best agent, not its last one; see `evaluate`.
 

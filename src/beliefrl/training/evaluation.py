@@ -51,7 +51,7 @@ def summary(result: Episode) -> dict[str, Any]:
 
 
 def restore(
-    run: Run, task: Task | GymnasiumTask | None = None, agent: Agent | type | None = None, best: bool = False
+    run: Run, task: Task | GymnasiumTask | type | None = None, agent: Agent | type | None = None, best: bool = False
 ) -> tuple[Agent, Any, Any, str]:
     """The agent, the task, the trained states (leading axis: seed) and the precision (`Run.precision`) of a run.
 
@@ -76,7 +76,7 @@ def restore(
 def restore_seed(
     run: Run | str | os.PathLike[str],
     seed: int | None = None,
-    task: Task | GymnasiumTask | None = None,
+    task: Task | GymnasiumTask | type | None = None,
     agent: Agent | type | None = None,
     best: bool = False,
 ) -> tuple[Agent, Any, Any, str]:
@@ -176,7 +176,7 @@ def evaluate(
     run: Run | str | os.PathLike[str],
     episodes: int = 20,
     seed: int = 0,
-    task: Task | GymnasiumTask | None = None,
+    task: Task | GymnasiumTask | type | None = None,
     agent: Agent | type | None = None,
     progress: bool = True,
     best: bool = False,
@@ -187,7 +187,7 @@ def evaluate(
         run: a run, or its folder.
         episodes: episodes for each seed of the run and each mode.
         seed: the random seed of these episodes: the same seed gives the same numbers.
-        task: needed only if the run was trained on a task of your own.
+        task: needed only if the run was trained on a task of your own: that task, or its class of environments.
         agent: needed only if an agent of your own was trained: its class, or an instance.
         progress: show the progress while episodes are played: live in a terminal or a notebook; elsewhere a line after
             three seconds, and then once a minute.

@@ -116,7 +116,7 @@ def resume(
     Args:
         run: a run, or its folder.
         steps: the total number of environment steps; None: as many as before. It cannot be reduced.
-        task: needed only if the run was trained on a task of your own.
+        task: needed only if the run was trained on a task of your own: that task, or its class of environments.
         report, own_process, progress, callback: as in `train`.
         agent: needed only if an agent of your own was trained: its class, or an instance.
         stop_at: the option `stop_at` from now on; None: train for all steps; "same": as before. A training that has
