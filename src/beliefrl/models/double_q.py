@@ -164,7 +164,7 @@ def q_low(
 def likeness(policy: Policy, behaviour: Policy, action: Float[Array, "*batch action"]) -> Float[Array, "*batch"]:
     """min(1, π(a|s) / b(a|s)), from the densities before the tanh, because its derivative cancels.
 
-    a is taken as at most `ACTION_MAX`. So the ratio is not exact if a policy has |μ| over 7.
+    a is taken as at most `ACTION_MAX`. So the ratio is not exact where μ of a policy is beyond -7 or 7.
     """
     before = jnp.arctanh(jnp.clip(action, -ACTION_MAX, ACTION_MAX))
     pi, b = (gaussian_log_prob(before, each.mean, jnp.exp(each.log_sigma)) for each in (policy, behaviour))
