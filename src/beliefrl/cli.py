@@ -48,9 +48,6 @@ and exit code 2.
 """
 
 
-KEEPING = ("train", "resume", "sweep", "tune")  # the commands that save something when they are stopped
-
-
 def _fail(message: str) -> NoReturn:
     print("beliefrl:", " ".join(message.split()), file=sys.stderr)
     raise SystemExit(2)
@@ -81,8 +78,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     except (UsageError, UserError) as error:
         _fail(one_line(str(error)))
     except KeyboardInterrupt as stopped:
-        kept = " What was logged and saved stays in the folder of the run." if argv[0] in KEEPING else ""
-        what = str(stopped) or f"stopped.{kept}"
+        what = str(stopped) or "stopped; what was logged and saved until now is kept."
         print(f"beliefrl: {what}", file=sys.stderr)
         raise SystemExit(getattr(stopped, "exit_code", 130)) from None
     except BrokenPipeError:

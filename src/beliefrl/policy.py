@@ -224,7 +224,7 @@ def load(
     Args:
         run: a run, or its folder.
         seed: one of the run's seeds; None: its first.
-        task: needed only if the run was trained on a task of your own: that task, or its class of environments.
+        task: needed only if the run was trained on a task of your own: that task, or the class of its environments.
         agent: needed only if the run was trained by an agent of your own: its class, or an instance.
         best: take the seed's best agent, not its last one; see `evaluate`.
 

@@ -89,7 +89,7 @@ class PredictiveSACAgent(ControllerAgent):
     updates_per_step: int = 1
     """Updates of the controller for each environment step, also if the model learns less often."""
     batch_size: int = 128
-    """Transitions in an update of the controller. Those that are not valid do not count."""
+    """Transitions that are drawn for an update of the controller, including some from which nothing is learned."""
     lr_actor: float = 1e-3
     """Adam's learning rate for the actor."""
     lr_critic: float = 1e-3
@@ -134,7 +134,7 @@ class PredictiveSACAgent(ControllerAgent):
     long_memories: float = 0.25
     """Fraction of the LSTM's cells that start with a long memory, in [0, 1]."""
     longest_memory: int = 127
-    """The forget biases of these cells are log U(1, this): time constants of 2 to this + 1 steps at the start."""
+    """L: these cells start with forget biases of log U(1, L), which are time constants of 2 to L + 1 steps."""
     reward_memory: tuple[float, ...] = (8.0, 64.0, 512.0)
     """Time constants, in steps, of the memory of unusual rewards that the LSTM reads. The pre-training determines which
     rewards are unusual. Without any, there is no memory of rewards."""

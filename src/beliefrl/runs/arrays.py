@@ -71,7 +71,10 @@ def about(path: pathlib.Path) -> dict[str, str]:
 
 def misfit(path: pathlib.Path, name: str) -> UserError:
     """The error that an array of a file is missing, or of another shape or type."""
-    return UserError(f"{path} does not fit the agent in config.json (at {name}): they belong to different trainings.")
+    return UserError(
+        f"{path} does not fit the agent in config.json (at {name}): they belong to different trainings, or the task is "
+        "another one."
+    )
 
 
 def load(path: pathlib.Path) -> dict[str, np.ndarray]:

@@ -70,9 +70,8 @@ class GymnasiumTask:
         """
         environment = self.environment()
         environment.close()
-        actions = environment.inner_action_space
         size = self.faults.observed_size(environment.indices.size)
-        return Spec(size, actions.low.size, environment.limit or LARGEST, self.measures)
+        return Spec(size, environment.inner_action_space.low.size, environment.limit or LARGEST, self.measures)
 
     @cached_property
     def entry_names(self) -> tuple[str, ...]:

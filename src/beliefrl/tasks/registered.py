@@ -97,7 +97,7 @@ def _missing(id: str, found: Exception) -> str:
     if known and known.extra:
         return f"{PREFIX}{id} needs packages that are not installed: pip install 'beliefrl[{known.extra}]'."
     lacks = _first_sentence(found)
-    return f"{PREFIX}{id} needs something that is not installed ({lacks}): install it with pip, or start in its folder."
+    return f"{PREFIX}{id} needs something that is not installed ({lacks}): install it with pip, or go to its folder."
 
 
 def _first_sentence(found: Exception) -> str:

@@ -62,15 +62,11 @@ def restore(
         UserError: the run's agent or task is unknown here, or nothing was saved.
     """
     made = agent_of(run, agent)
-    found = task_of(run) if task is None else task_like(run, task)
+    found = task_of(run, task)
     spec = found.spec
     keys = jax.random.split(jax.random.key(0), len(run.seeds))
     like = jax.eval_shape(jax.vmap(lambda key: made.networks(made.init(key, spec))), keys)
-    try:
-        return made, found, run.load(like, best), run.precision
-    except UserError as error:
-        hint = "" if task is None else " Or the given task is not that of the training."
-        raise UserError(f"{error}{hint}") from None
+    return made, found, run.load(like, best), run.precision
 
 
 def restore_seed(
@@ -123,14 +119,27 @@ def as_argument(run: Run) -> str:
     return f"{run.folder} --agent {one_line(name)}" if agents.is_own(name) else str(run.folder)
 
 
-def task_of(run: Run | str | os.PathLike[str]) -> Any:
+def task_of(run: Run | str | os.PathLike[str], task: Task | GymnasiumTask | type | None = None) -> Any:
     """The task that a run was trained on, as `make_task` makes it; a `gym:PACKAGE:ID` imports its package.
 
+    Args:
+        run: a run, or its folder.
+        task: the task that is returned instead, or the class of its environments.
+
     Raises:
-        UserError: there is no such run, one of its constants is impossible, or it was trained on a task of your own,
-            which cannot be found by a name.
+        UserError: there is no such run, one of its constants is impossible, it was trained on a task of your own, which
+            cannot be found by a name, or the agent observed other entries than the given task shows.
     """
     run = run if isinstance(run, Run) else Run(run)
+    if task is not None:
+        made, observed = given(task), run.config.get("observe")
+        shown = tasks.describe(made)["observe"]
+        if shown != observed:
+            raise UserError(
+                f"{run.folder} was trained on {_entries(observed)} of the observation, and the given task shows "
+                f"{_entries(shown)}: give the same."
+            )
+        return made
     name, constants = run.config["task"], tuples(run.config["constants"])
     if not tasks.knows(name):
         raise UserError(
@@ -139,22 +148,6 @@ def task_of(run: Run | str | os.PathLike[str]) -> Any:
         )
     with _naming(run):
         return tasks.make(name, **constants | {each: run.config.get(each) for each in ("observe", "faults")})
-
-
-def task_like(run: Run, task: Any) -> Any:
-    """A task that a user gives for a run, after a check that the agent observes the entries that it was trained with.
-
-    Raises:
-        UserError: it is no task, or other entries are observed.
-    """
-    made, observed = given(task), run.config.get("observe")
-    now = tasks.describe(made)["observe"]
-    if now != observed:
-        raise UserError(
-            f"{run.folder} was trained on {_entries(observed)} of the observation, and the given task shows "
-            f"{_entries(now)}: give the same."
-        )
-    return made
 
 
 def _entries(observed: list[int] | None) -> str:
@@ -187,7 +180,7 @@ def evaluate(
         run: a run, or its folder.
         episodes: episodes for each seed of the run and each mode.
         seed: the random seed of these episodes: the same seed gives the same numbers.
-        task: needed only if the run was trained on a task of your own: that task, or its class of environments.
+        task: needed only if the run was trained on a task of your own: that task, or the class of its environments.
         agent: needed only if an agent of your own was trained: its class, or an instance.
         progress: show the progress while episodes are played: live in a terminal or a notebook; elsewhere a line after
             three seconds, and then once a minute.

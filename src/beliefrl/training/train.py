@@ -18,7 +18,7 @@ from beliefrl.tasks import Task
 from beliefrl.tasks.given import given
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import initial
-from beliefrl.training.evaluation import agent_of, task_like, task_of
+from beliefrl.training.evaluation import agent_of, task_of
 from beliefrl.training.schedule import Event, Options, capacity
 from beliefrl.training.session import Callback, Session
 from beliefrl.types import UserError, tuples
@@ -116,7 +116,7 @@ def resume(
     Args:
         run: a run, or its folder.
         steps: the total number of environment steps; None: as many as before. It cannot be reduced.
-        task: needed only if the run was trained on a task of your own: that task, or its class of environments.
+        task: needed only if the run was trained on a task of your own: that task, or the class of its environments.
         report, own_process, progress, callback: as in `train`.
         agent: needed only if an agent of your own was trained: its class, or an instance.
         stop_at: the option `stop_at` from now on; None: train for all steps; "same": as before. A training that has
@@ -154,7 +154,7 @@ def _go_on(
     _ = Options(**_options(run) | changes)  # raise before the folder is locked
     with contextlib.ExitStack() as showing, contextlib.ExitStack() as stack:
         recorder = stack.enter_context(Recorder(folder, None))
-        made = task_of(recorder) if task is None else task_like(recorder, task)
+        made = task_of(recorder, task)
         before = _options(recorder)
         steps = changes.get("steps", before["steps"])
         if steps < before["steps"]:
@@ -210,8 +210,8 @@ def _chosen(options: dict[str, Any]) -> Options:
     for name in options:
         if name not in known:
             raise UserError(
-                f"Training has no option {name!r}: it has {', '.join(known)}. Hyperparameters are given to make_agent, "
-                "and what is observed to make_task."
+                f"Training has no option {name!r}: it has {', '.join(known)}. Give hyperparameters to make_agent, and "
+                "observe to make_task."
             )
     source = options.get("init_from")
     path = source.folder if isinstance(source, Run) else source

@@ -153,7 +153,7 @@ def play(
         steps: stop after this many steps; None: play until the task ends the episode.
         at: timesteps whose frames are kept, such as range(0, 1000, 10). The last timestep is added, unless `at` is
             empty.
-        task: needed only if the run was trained on a task of your own: that task, or its class of environments.
+        task: needed only if the run was trained on a task of your own: that task, or the class of its environments.
         agent: needed only if the run was trained by an agent of your own: its class, or an instance.
         best: take the seed's best agent, not its last one; see `evaluate`.
 

@@ -60,7 +60,7 @@ def video(
         fps: timesteps per second of the video, each with a frame. None: real time, with at most `fastest` frames per
             second; a task whose step has no known duration gets 10 steps per second.
         steps: stop each episode after this many steps; None: play until the task ends it.
-        task: needed only if the run was trained on a task of your own: that task, or its class of environments.
+        task: needed only if the run was trained on a task of your own: that task, or the class of its environments.
         agent: needed only if the run was trained by an agent of your own: its class, or an instance.
         best: take the seed's best agent, not its last one; see `evaluate`.
         fastest: the highest number of frames per second if `fps` is None.
@@ -233,7 +233,7 @@ def film(
         episode_seed: random seed of the episodes.
         sampled: sample the actions, instead of taking the policy's mode.
         steps: stop the episodes after this many steps; None: play until the task ends them.
-        task: needed only if the runs were trained on a task of your own: that task, or its class of environments.
+        task: needed only if the runs were trained on a task of your own: that task, or the class of its environments.
         agent: needed only if the run was trained by an agent of your own: its class, or an instance.
         best: take the seed's best agent, not its last one; see `evaluate`.
         start: step of the first frame, counted as `steps` from the start of the episode.

@@ -96,7 +96,7 @@ def predictions(
         samples: number of samples in the mean of each prediction.
         episode_seed: random seed of the episode, its actions and the samples.
         sampled: sample the actions, instead of taking the policy's mode.
-        task: needed only if the run was trained on a task of your own: that task, or its class of environments.
+        task: needed only if the run was trained on a task of your own: that task, or the class of its environments.
         agent: needed only if the run was trained by an agent of your own: its class, or an instance.
         best: take the seed's best agent, not its last one; see `evaluate`.
 
