@@ -22,7 +22,7 @@ AGENTS = ("vrm", "sac-mlp", "sac-lstm", "predictive-sac", *NIGHTLY)
 
 
 def a_policy(name):
-    return Policy(tiny(name), TASK.spec, begun(name, TASK.spec, jax.random.key(0)))
+    return Policy(tiny(name), TASK.spec, begun(name, TASK.spec, jax.random.key(0)), seed=3)
 
 
 def session_of(content):
@@ -52,6 +52,7 @@ def test_the_model_acts_as_the_policy_does_for_any_batch_size(name, tmp_path):
     policy = a_policy(name)
     assert 0 <= policy.export(tmp_path / "policy.onnx") < 1e-5
     session = session_of((tmp_path / "policy.onnx").read_bytes())
+    assert session.get_modelmeta().custom_metadata_map["policy"] == repr(policy)
     assert session.get_outputs()[0].name == "action"
     assert {each.shape[0] for each in (*session.get_inputs(), *session.get_outputs())} == {"batch"}
     for batch in (1, 3):

@@ -194,7 +194,7 @@ class Policy:
         if path.exists() and not overwrite:
             raise UserError(f"{path} exists already: choose another file, or replace it with overwrite (--overwrite).")
         if path.suffix.lower() == ".onnx":
-            in_float32 = Policy(self.agent, self.spec, self._state, task=self.task)
+            in_float32 = Policy(self.agent, self.spec, self._state, task=self.task, seed=self.seed)
             content, difference = onnx.export(in_float32, self.environment)
         else:
             content, difference = self._for_jax(), None

@@ -151,3 +151,13 @@ def test_timesteps_that_do_not_exist_enter_no_loss(state):
 def test_impossible_hyperparameters_are_refused(wrong):
     with pytest.raises(UserError, match=f"{next(iter(wrong))}="):
         SLACAgent(**wrong)
+
+
+def test_the_first_timestep_of_an_episode_has_no_previous_action():
+    """`replay.sample` marks the oldest timestep of a full ring as the first of an episode."""
+    drawn = windows(jax.random.key(1), 2, 6)
+    marked = drawn.step._replace(is_first=drawn.step.is_first.at[3, 1].set(True))
+    step = begin_windows(drawn._replace(step=marked)).step
+    assert np.all(step.prev_action[0] == 0)
+    assert np.all(step.prev_action[3, 1] == 0)
+    assert np.any(step.prev_action[3, 0] != 0)

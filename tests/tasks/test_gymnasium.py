@@ -273,3 +273,18 @@ def test_an_environment_is_one_that_others_can_use():
     assert isinstance(environment, gymnasium.Env)
     assert environment.observation_space.shape == BOX.shape
     assert environment.action_space == spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+
+def test_a_measure_keeps_the_value_that_was_reported_last():
+    class Reports(Fine):
+        def step(self, action):
+            *result, _ = super().step(action)
+            return *result, {"is_success": True, "distance": 0.5} if self.time == 3 else {}
+
+    environment = GymnasiumTask(Reports, measures=("success", "distance")).environment()
+    environment.reset(seed=0)
+    seen = [environment.step(np.zeros(1))[-1] for _ in range(5)]
+    assert [each["success"] for each in seen] == [0, 0, 1, 1, 1]
+    assert [each["distance"] for each in seen] == [0, 0, 0.5, 0.5, 0.5]
+    environment.reset(seed=0)
+    assert environment.step(np.zeros(1))[-1] == {"success": 0, "distance": 0}

@@ -220,6 +220,6 @@ class SLACAgent(SACAgent):
 
 def begin_windows(windows: Window) -> Window:
     """The windows (time-major), with their first timestep marked as the first of an episode."""
-    step = windows.step
-    step = step._replace(is_first=step.is_first.at[0].set(True), prev_action=step.prev_action.at[0].set(0.0))
-    return windows._replace(step=step)
+    first = windows.step.is_first.at[0].set(True)
+    prev_action = jnp.where(first[..., None], 0.0, windows.step.prev_action)  # the oldest of a full replay has one
+    return windows._replace(step=windows.step._replace(is_first=first, prev_action=prev_action))

@@ -163,12 +163,12 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         return obs, reward, terminated, truncated, self._measures(info, terminated or truncated)
 
     def _measures(self, info: Any, ended: bool) -> dict[str, Any]:
-        """The task's measures as the infos of this episode reported them last; 0 before the first report."""
+        """The task's measures as the infos of this episode reported them last; 0 before. Success may be missing."""
         for name in self.task.measures:
             value = measure_of(info, name)
             if value is not None:
                 self._measured[name] = value
-            elif ended and name not in self._measured:
+            elif ended and name not in ("success", *self._measured):
                 raise self._fault(f"no info of an episode has a number {name!r}, which the task measures")
         return dict.fromkeys(self.task.measures, 0.0) | self._measured
 
@@ -290,9 +290,9 @@ class FaultyEnvironment(Environment):
 
 
 def measure_of(info: Any, name: str) -> float | None:
-    """A number in the info of a step, or None. Success may be called `is_success`, and is 0 if absent."""
+    """A number in the info of a step, or None. Success may be called `is_success`."""
     found = info if isinstance(info, dict) else {}
-    value: Any = found.get("is_success", found.get("success", 0.0)) if name == "success" else found.get(name)
+    value: Any = found.get("is_success", found.get("success")) if name == "success" else found.get(name)
     try:
         number = float(np.max(value))
     except (TypeError, ValueError):
