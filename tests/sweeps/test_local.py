@@ -213,6 +213,21 @@ def test_the_forecast_is_what_is_left_at_the_pace_seen(tmp_path, monkeypatch):
     assert forecast.seconds_left(status) == 30 + 200
 
 
+def test_a_continued_training_learns_from_its_first_new_update_on(tmp_path, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
+    training, waiting = plan([Experiment("vrm", "pendulum", {"steps": 100}, seeds=(0, 1))])
+    run = a_run(tmp_path / training.name, [[]], updates=[(40, {"loss": 1.0})])
+    forecast, status = Forecast(tmp_path), SweepStatus([], [waiting], {training.name: training})
+    for now[0], step in ((0.0, 40), (20.0, 60), (60.0, 80)):  # 20 s for the start, then 2 s per step
+        row = {"step": step, "kind": "update", "loss": 1.0}
+        (run.folder / "metrics" / "seed-0.jsonl").write_text(json.dumps(row) + "\n")
+        forecast.watch(status)
+        (progress,) = forecast.going.values()
+        assert progress.doing == ("starting" if step == 40 else "learning")
+    assert progress.pace == (20.0, 2.0)
+
+
 def test_what_a_training_does_is_read_off_its_last_lines(tmp_path):
     (training,) = plan([Experiment("vrm", "pendulum", {"steps": 100}, seeds=(0,))])
     forecast, status = Forecast(tmp_path), SweepStatus([], [], {training.name: training})

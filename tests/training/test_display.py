@@ -12,6 +12,7 @@ from rich.console import Console
 
 from beliefrl import agents, evaluate, train
 from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.training import display as module
 from beliefrl.training import screen as screens
 from beliefrl.training.display import TrainingDisplay, results_table
 from beliefrl.training.rollout import Episode
@@ -58,6 +59,15 @@ def test_an_evaluation_does_not_begin_a_phase(display):
         display(Event(phase, step))
     assert said(display.screen.console.file.getvalue()) == ["exploring"]
     assert display.phase_step == 0
+
+
+def test_the_time_left_of_a_resumed_pretraining_is_that_of_its_new_updates(display, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
+    display(Event(Phase.PRETRAINING, 0))
+    for now[0], done, left in ((5.0, 4_000, ""), (15.0, 4_100, ", 1:30 left in this phase")):
+        display(Event(Phase.PRETRAINING, 0, part=(done, 5_000)))
+        assert display.progress.tasks[0].fields["status"] == f"{done:,}/5,000 updates{left}"
 
 
 def test_a_log_gets_a_line_where_nothing_else_was_printed_for_a_minute(run, monkeypatch):

@@ -11,6 +11,7 @@ from beliefrl.training import phases, schedule
 from beliefrl.training.evaluation import evaluate, summary
 from beliefrl.training.log import without
 from beliefrl.training.rollout import Episode
+from beliefrl.training.schedule import Event, Phase
 from beliefrl.types import UserError
 from worlds import MODELS, SEQUENCES, SHARED, Counting, CountingAgent, leaves, trained
 
@@ -214,10 +215,18 @@ def test_success_is_a_rate():
 
 
 def test_a_lost_seed_has_no_success_and_does_not_count():
-    table = summary(without(episode(TOTAL, SUCCESS), {1}))
+    event = without(Event(Phase.EVALUATING, 5, evaluation=episode(TOTAL, SUCCESS)), {1})
+    assert event.evaluation is not None
+    table = summary(event.evaluation)
     assert table["sampled"]["seeds_success"] == [0.5, None, 1.0]
     assert table["sampled"]["success"] == 0.75
     assert table["sampled"]["seeds"] == [1.5, None, 1.5]
+
+
+def test_a_lost_seed_has_no_ends_of_episodes():
+    event = without(Event(Phase.LEARNING, 5, episodes=episode(TOTAL[:, 0], SUCCESS[:, 0])), {1})
+    assert event.episodes is not None
+    assert event.episodes.done.any(axis=1).tolist() == [True, False, True]
 
 
 def test_one_seed_has_no_standard_error():

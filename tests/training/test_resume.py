@@ -187,6 +187,35 @@ def test_train_goes_on_where_it_is_asked_to(whole, tmp_path):
     assert len(run.config["resumed"]) == 2
 
 
+def test_a_refused_resume_changes_nothing(whole, tmp_path):
+    folder, _ = whole
+    for task, phrase in (
+        (make("pendulum-p"), "was trained with task=pendulum-v, not pendulum-p: give that task"),
+        (make("pendulum-v", mass=2.0), "was trained with constants="),
+        (make("pendulum-v", faults={"noise": 0.1}), "was trained with faults=None, not"),
+    ):
+        config = (folder / "config.json").read_bytes()
+        with pytest.raises(UserError, match=phrase):
+            resume(folder, steps=240, task=task)
+        assert (folder / "config.json").read_bytes() == config
+    explored = train(AGENT, "pendulum-v", tmp_path / "run", **OPTIONS | {"steps": 20, "replay_capacity": 30})
+    with pytest.raises(UserError, match="replay_capacity=30 is too small"):
+        resume(explored, steps=240)
+    assert explored.options.steps == 20
+
+
+def test_a_task_of_ones_own_goes_on_with_other_arguments(tmp_path):
+    """A robot may have another port."""
+
+    class Other(Fine):
+        pass
+
+    run = train(AGENT, GymnasiumTask(Fine, arguments={"port": 4}), tmp_path / "run", **OPTIONS | {"steps": 60})
+    assert resume(run, steps=80, task=GymnasiumTask(Fine, arguments={"port": 5})).options.steps == 80
+    with pytest.raises(UserError, match=r"was trained with task=Fine, not .*Other: give that task"):
+        resume(run, steps=100, task=Other)
+
+
 @pytest.mark.slow
 def test_a_finished_training_can_be_made_longer(whole, tmp_path):
     folder, _ = whole

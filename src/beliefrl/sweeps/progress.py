@@ -47,28 +47,32 @@ class SweepProgress:
         self.training, self._path = training, folder / training.name
         self.step, self.doing, self.last_return = 0, "starting", None
         self._began, self._learns_since = time.monotonic(), None
+        self._first_step: int | None = None  # the last update at the first look: a continued training has some
 
     def read(self) -> None:
         """Read the new rows of the log."""
         try:
             rows = Run(self._path).last_rows(self.training.seeds[0])
         except UserError:
+            self._first_step = 0
             return  # its folder does not exist yet
+        updates = [row["step"] for row in rows if row["kind"] == "update"]
+        if self._first_step is None:
+            self._first_step = max(updates, default=0)
         for row in rows:
             if row["kind"] == "pretrain":
                 self.doing = f"pre-training, {row['step']:,} updates"
                 continue
             self.step = max(self.step, row["step"])
-            if row["kind"] == "update":
-                self.doing = "learning"
-            elif row["kind"] == "evaluation":
+            if row["kind"] == "evaluation":
                 self.last_return = statistics.fmean(row["sampled"])
-        if self.doing == "learning" and self._learns_since is None:
-            self._learns_since = time.monotonic(), self.step
+        if max(updates, default=0) > self._first_step:
+            self.doing = "learning"
+            self._learns_since = self._learns_since or (time.monotonic(), self.step)
 
     @property
     def pace(self) -> Pace | None:
-        """The speed so far; None until learning has advanced."""
+        """The speed so far; None until learning has advanced. A continued training begins without pre-training."""
         if self._learns_since is None or self.step <= self._learns_since[1]:
             return None
         since, first_step = self._learns_since

@@ -39,6 +39,7 @@ class TrainingDisplay:
         self.phase = Phase.STARTING
         self.phase_began = time.monotonic()
         self.phase_step = 0
+        self.first_part: tuple[float, int] | None = None  # when the first update of a phase was shown, and its number
 
     def __enter__(self) -> "TrainingDisplay":
         self.screen.__enter__()
@@ -62,8 +63,11 @@ class TrainingDisplay:
             self.returns = f"last returns {ended.mean():.1f}"
         if event.part:
             done, of = event.part
-            left = (now - self.phase_began) / done * (of - done)
-            self._status(event, done, of, f"{done:,}/{of:,} updates, {duration(left)} left in this phase")
+            began, first = self.first_part = self.first_part or (now, done)
+            status = f"{done:,}/{of:,} updates"
+            if done > first:
+                status += f", {duration((now - began) / (done - first) * (of - done))} left in this phase"
+            self._status(event, done, of, status)
         else:
             status = f"step {event.step:,}/{self.steps:,}  {self._speed(event, now)}  {self.returns}"
             self._status(event, event.step, self.steps, status)
@@ -72,7 +76,7 @@ class TrainingDisplay:
 
     def _begin_phase(self, event: Event, now: float) -> None:
         """Begin to time a phase, and print its name if the screen is not live."""
-        self.phase, self.phase_began, self.phase_step = event.phase, now, event.step
+        self.phase, self.phase_began, self.phase_step, self.first_part = event.phase, now, event.step, None
         if not self.screen.is_live:
             self.screen.line(event.phase)
 

@@ -26,16 +26,22 @@ def finite(states: Any) -> Bool[Array, " seed"]:
     return jnp.all(jnp.stack(checks), axis=0)
 
 
-def without(evaluation: Episode, lost: Collection[int]) -> Episode:
-    """The same evaluation with NaN as the returns and measures of the `lost` seeds (indices)."""
+def without(event: Event, lost: Collection[int]) -> Event:
+    """The same event without the `lost` seeds (indices): NaN in their evaluations, and no ends of their episodes."""
 
-    def blank(leaf: Any) -> Any:
+    def with_value(leaf: Any, value: Any) -> np.ndarray:
         leaf = np.array(leaf)
-        leaf[sorted(lost)] = np.nan
+        leaf[sorted(lost)] = value
         return leaf
 
-    measures = jax.tree.map(blank, evaluation.measures)
-    return evaluation._replace(episode_return=blank(evaluation.episode_return), measures=measures)
+    if event.episodes is not None:
+        event = event._replace(episodes=event.episodes._replace(done=with_value(event.episodes.done, False)))
+    if event.evaluation is not None:
+        returns, measures = jax.tree.map(
+            lambda leaf: with_value(leaf, np.nan), (event.evaluation.episode_return, event.evaluation.measures)
+        )
+        event = event._replace(evaluation=event.evaluation._replace(episode_return=returns, measures=measures))
+    return event
 
 
 def record(recorder: Recorder, event: Event, lost: Collection[int]) -> dict[str, Any] | None:

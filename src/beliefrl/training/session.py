@@ -137,8 +137,8 @@ class Session:
         """Record an event; returns whether the training ends with it, before its last step."""
         self.step = event.step
         self._look_for_divergence(event)
-        if event.evaluation is not None and self.lost:
-            event = event._replace(evaluation=log.without(event.evaluation, self.lost))
+        if self.lost:
+            event = log.without(event, self.lost)
         if event.states is not None:
             event = event._replace(states=self.agent.networks(event.states))
         self.results = log.record(self.recorder, event, self.lost) or self.results

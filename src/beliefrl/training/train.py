@@ -125,8 +125,8 @@ def resume(
         stop_patience: the option `stop_patience` from now on; None: as before.
 
     Raises:
-        UserError: there is no such run, it has no undamaged checkpoint, another process trains it, or `steps` is too
-            small.
+        UserError: there is no such run, it has no undamaged checkpoint, another process trains it, `steps` is too
+            small, or `task` is another one.
         Stopped: Ctrl-C or SIGTERM, after a checkpoint is written.
     """
     limits = {"stop_at": stop_at, "step_timeout": step_timeout}
@@ -155,11 +155,14 @@ def _go_on(
     with contextlib.ExitStack() as showing, contextlib.ExitStack() as stack:
         recorder = stack.enter_context(Recorder(folder, None))
         made = task_of(recorder, task)
+        if task is not None:
+            _check_same_task(recorder, made)
         before = _options(recorder)
         steps = changes.get("steps", before["steps"])
         if steps < before["steps"]:
             raise UserError(f"steps={steps} is impossible: {folder} trains for {before['steps']}, and may only grow.")
         options = Options(**before | changes)
+        _ = capacity(made_by, options)  # raise before the run's config changes
         _check_possible(options, made, own_process)
         recorder.amend({"options": dataclasses.asdict(options)}, provenance())
         listen = showing.enter_context(_reporting(recorder, *listeners, progress))
@@ -249,6 +252,21 @@ def _check_same(run: Run, config: dict[str, Any], older: dict[str, Any]) -> None
         if there.get(name, value) != value:
             change = "choose another --out, in Python out="
             raise UserError(f"{run.folder} was trained with {name}={there[name]}, not {value}: {change}.")
+
+
+def _check_same_task(run: Run, task: Any) -> None:
+    """Raise a UserError if a run was trained on another task, with other constants, or with other faults.
+
+    A class may be imported from another module, and the arguments of a Gymnasium environment may differ.
+    """
+    asked, there = ({"faults": None} | each for each in (tasks.describe(task), run.config))
+    same = ("task", "faults") if isinstance(task, GymnasiumTask) else ("task", "faults", "constants")
+    for name in same:
+        given, known = (json.loads(json.dumps(each[name], default=str)) for each in (asked, there))
+        if name == "task":
+            given, known = (each.rpartition(":")[2] for each in (given, known))
+        if given != known:
+            raise UserError(f"{run.folder} was trained with {name}={there[name]}, not {asked[name]}: give that task.")
 
 
 def _with_functions_of(there: Any, asked: Any) -> Any:
