@@ -65,6 +65,8 @@ def _is_number(value: Any, whole: bool) -> bool:
 def check_indices(indices: Sequence[Any], size: int) -> None:
     """Raise a UserError unless `indices` has at least one index of an observation with `size` entries, each once."""
     allowed = f"give indices from 0 to {size - 1}."
+    if isinstance(indices, int):
+        raise UserError(f"observe={indices} is not a list of indices: give ({indices},).")
     for position, index in enumerate(indices):
         if not (_is_number(index, whole=True) and 0 <= index < size):
             has = "1 entry" if size == 1 else f"{size} entries"

@@ -5,7 +5,7 @@ import pytest
 from safetensors.numpy import save_file
 
 from beliefrl.analysis import panels
-from beliefrl.analysis.figures import draw_curve, evaluations, standard_error
+from beliefrl.analysis.figures import draw_curve, standard_error
 from beliefrl.analysis.groups import groups
 from beliefrl.analysis.panels import dashes
 from beliefrl.analysis.tables import (
@@ -30,6 +30,11 @@ from inputs import HOUR, TWO_SEEDS, a_run, flat
 def with_success(seeds):
     """The same evaluations, with success in the first of two episodes."""
     return [[(step, returns, [True, False]) for step, returns in rows] for rows in seeds]
+
+
+def evaluations(run, name):
+    (group,) = groups([run])
+    return group.curve(name)
 
 
 def test_evaluations_are_every_seeds_means(tmp_path):
@@ -66,6 +71,15 @@ def test_the_curve_is_a_picture_in_the_runs_folder(tmp_path):
     picture = draw_curve(a_run(tmp_path, TWO_SEEDS))
     assert picture == tmp_path / "curve.png"
     assert min(size(picture)) > 100
+    picture.unlink()
+    assert draw_curve(tmp_path) == picture
+    assert picture.exists()
+
+
+@pytest.mark.parametrize(("path", "phrase"), [("no/curve.png", "there is no folder"), ("curve.txt", "written as .png")])
+def test_a_curve_that_cannot_be_written_is_one_sentence(tmp_path, path, phrase):
+    with pytest.raises(UserError, match=phrase):
+        draw_curve(a_run(tmp_path, TWO_SEEDS), tmp_path / path)
 
 
 def test_one_seed_has_a_curve_too(tmp_path):
@@ -92,7 +106,7 @@ def test_there_is_no_curve_without_evaluations(tmp_path, seeds):
 def test_a_row_tells_returns_with_their_spread_and_when_the_task_was_solved(tmp_path):
     made = [a_run(tmp_path / "a", [flat(100, 960, 500), flat(100, 980, 700)], task="cartpole", **HOUR)]
     ((task, agent, seeds, steps, sampled, mode, solved, time),) = final_rows(groups(made))
-    assert (task, agent, seeds, steps) == ("`cartpole`", "`vrm`", "0 to 1", "30")
+    assert (task, agent, seeds, steps) == ("cartpole", "vrm", "0 to 1", "30")
     assert sampled == "600.0 ± 100.0"
     assert mode == "7.0 ± 0.0"
     assert solved == "20"  # the mean over seeds is 970 there
@@ -137,6 +151,17 @@ def test_what_would_break_a_table_is_escaped():
     columns = [Column("a"), Column("b", is_number=True)]
     assert markdown(columns, [("x|y", "1")]) == "| a | b |\n| --- | ---: |\n| x\\|y | 1 |\n"
     assert r"a\_b & 5\% $\pm$ 1 \\" in latex(columns, [("a_b", "5% ± 1")])
+    assert r"\#1 & a \& b \\" in latex(columns, [("#1", "a & b")])
+
+
+@pytest.mark.parametrize("command", ["figure table", "report"])
+def test_a_folder_in_place_of_a_file_is_one_sentence(tmp_path, capsys, command, monkeypatch):
+    run = a_run(tmp_path / "a", [flat(-150.0)])
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main([*command.split(), str(run.folder), "-o", "."])
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.count("\n") == 1
 
 
 # The table of the cost of training, for runs with known times and sizes.

@@ -6,7 +6,15 @@ import shutil
 import numpy as np
 import pytest
 
-from beliefrl.analysis.aggregate import BOUNDS, draw_aggregate, interquartile_mean, interval, profile, scores
+from beliefrl.analysis.aggregate import (
+    BOUNDS,
+    draw_aggregate,
+    interquartile_mean,
+    interval,
+    known_bounds,
+    profile,
+    scores,
+)
 from beliefrl.analysis.groups import find, groups, is_finished, last_step
 from beliefrl.types import UserError
 from inputs import a_run, flat
@@ -201,6 +209,12 @@ def test_scores_are_between_a_random_policy_and_a_good_one(tmp_path):
     first, second = scores(groups(runs))["vrm"]
     np.testing.assert_allclose(first, [0.0, 1.0])
     np.testing.assert_allclose(second, [50 / 75, 100 / 75])
+
+
+def test_bounds_are_of_a_task_and_its_masked_versions_only():
+    assert known_bounds("pendulum-v") == known_bounds("pendulum-p") == BOUNDS["pendulum"]
+    assert known_bounds("pendulum mass=2.0") is None
+    assert known_bounds("cartpole-swing-up") is None
 
 
 def test_only_tasks_that_all_agents_have_count(tmp_path):

@@ -153,14 +153,14 @@ def test_a_kept_figure_is_drawn_by_one_command(tmp_path, capsys):
     cli.main(["figure", "elbo", file, "-o", str(tmp_path / "elbo.png")])
     assert (tmp_path / "elbo.png").read_bytes().startswith(b"\x89PNG")
     cli.main(["figure", "table", file, "--agents", "vrm", "--tasks", "pendulum-v", "-o", str(tmp_path / "table.md")])
-    assert "| `pendulum-v` | `vrm` | 0 to 2 | 15,000 | -285.3 ± 62.2 | -141.7 ± 22.4 |" in capsys.readouterr().out
+    assert "| pendulum-v | vrm | 0 to 2 | 15,000 | -285.3 ± 62.2 | -141.7 ± 22.4 |" in capsys.readouterr().out
 
 
 def test_runs_are_chosen_by_name_and_drawn_up_to_a_step(tmp_path, capsys):
     file = tmp_path / "kept.json.gz"
     packed(file, a_run(tmp_path / "one", [flat(1.0, 2.0, 3.0)]), a_run(tmp_path / "two", [flat(8.0)], first=1))
     cli.main(["figure", "table", str(file), "--names", "o*", "--until", "20", "-o", str(tmp_path / "table.md")])
-    assert "| `pendulum-v` | `vrm` | 0 | 20 | 2.0 |" in capsys.readouterr().out
+    assert "| pendulum-v | vrm | 0 | 20 | 2.0 |" in capsys.readouterr().out
 
 
 def test_the_curve_of_one_run_is_drawn_and_of_two_it_is_asked_which(tmp_path, capsys):

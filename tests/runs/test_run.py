@@ -163,6 +163,7 @@ def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
         CONFIG | {"hyperparameters": []},
         CONFIG | {"options": {}},
         CONFIG | {"observe": 5},
+        CONFIG | {"initial": "x"},
         CONFIG | {"resumed": 5},
         CONFIG | {"resumed": [5]},
         CONFIG | {"versions": "new"},

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from beliefrl import agents, load, resume, train
-from beliefrl.analysis.figures import draw_curve, evaluations
-from beliefrl.analysis.groups import is_finished
+from beliefrl.analysis.figures import draw_curve
+from beliefrl.analysis.groups import groups, is_finished
 from beliefrl.cli import main
 from beliefrl.runs.arrays import load as load_arrays
 from beliefrl.runs.arrays import packed
@@ -338,7 +338,7 @@ def test_a_seed_that_diverges_stops_alone(tmp_path, monkeypatch, what, why):
     kept = load_arrays(run.folder / "checkpoints" / "kept-for-seed-1" / "state.safetensors")
     assert all(np.isfinite(array).all() for array in kept.values())
     assert np.isfinite(load(run, seed=1).predict(np.zeros(1))[0]).all()  # as it was at 120
-    _, means = evaluations(run, "mode")
+    _, means = groups([run])[0].curve("mode")
     np.testing.assert_array_equal(np.isnan(means), [[False, False], [False, True]])
     assert draw_curve(run).exists()
     assert json.loads((run.folder / "results.json").read_text())

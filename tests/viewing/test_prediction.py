@@ -323,3 +323,8 @@ def test_a_runs_seed_is_played_by_its_number(tmp_path):
     assert not np.allclose(first.steps.prev_action, second.steps.prev_action)
     with pytest.raises(UserError, match="has no seed 6: it has 4, 5"):
         beliefrl.play(run, 6)
+
+
+def test_timesteps_of_frames_may_be_an_array(tmp_path):
+    run = saved(tmp_path / "run", "sac-mlp", SHORT)
+    assert list(beliefrl.play(run, at=np.array([0]), steps=2).frames) == [0, 2]

@@ -13,7 +13,7 @@ from beliefrl.catalogue import AGENT_GROUP as GROUP
 from beliefrl.catalogue import agent_names as names  # noqa: F401 - agents.names
 from beliefrl.imports import declared, declared_name, is_named, load, load_declared, path
 from beliefrl.models.nets import Gaussian
-from beliefrl.types import Spec, Timestep, UserError, Window, WindowShape
+from beliefrl.types import Spec, Timestep, UserError, Window, WindowShape, short
 
 Metrics = dict[str, Float[Array, ""]]
 
@@ -188,7 +188,23 @@ def make(name: str, /, **hyperparameters: Any) -> Agent:
     Raises:
         UserError: no agent has that name, it has no such hyperparameter, or a value is impossible.
     """
+    if not isinstance(name, str):
+        raise UserError(f"{short(name)} is not the name of an agent: make_agent takes a name, such as vrm.")
     return build(named(name), hyperparameters, name)
+
+
+def given(agent: Any) -> Agent:
+    """The agent itself, or the one of this name.
+
+    Raises:
+        UserError: no agent has that name, it is a class, or no agent at all.
+    """
+    if isinstance(agent, str):
+        return make(agent)
+    if isinstance(agent, type):
+        raise UserError(f"{path(agent)} is a class: give an agent, {agent.__name__}().")
+    check_class(type(agent))
+    return agent
 
 
 def named(name: str) -> Any:

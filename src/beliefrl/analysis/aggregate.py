@@ -79,8 +79,11 @@ def bounds(task: str, final: dict[tuple[str, str], np.ndarray]) -> tuple[float, 
 
 
 def known_bounds(task: str) -> tuple[float, float] | None:
-    """The task's entry in BOUNDS, which also holds for its masked versions; None if there is none."""
-    return next((both for name, both in BOUNDS.items() if task.startswith(name)), None)
+    """The task's entry in BOUNDS, which also holds for its masked versions; None if there is none.
+
+    A task with other constants or with faults has none: `task` then has more words than its name.
+    """
+    return BOUNDS.get(task.removesuffix("-v").removesuffix("-p"))
 
 
 def _normalised(returns: np.ndarray, ends: tuple[float, float]) -> np.ndarray:

@@ -4,12 +4,13 @@ No file is left half written.
 """
 
 import io
+import os
 import pathlib
 from typing import Any
 
 import numpy as np
 
-from beliefrl.analysis.groups import Curve, Group, task_of
+from beliefrl.analysis.groups import Group, task_of
 from beliefrl.runs.arrays import write_whole
 from beliefrl.runs.run import Run
 from beliefrl.types import UserError, cause
@@ -59,22 +60,17 @@ def save(figure: Any, path: pathlib.Path) -> pathlib.Path:
         UserError: the files cannot be written.
     """
     for name in paths(path):
-        content = io.BytesIO()
-        figure.savefig(content, format=name.suffix[1:], dpi=150)
-        try:
-            write_whole(name, content.getvalue())
-        except OSError as error:
-            raise UserError(f"{name} cannot be written ({cause(error)}): choose another file.") from None
+        _write(figure, name)
     return paths(path)[0]
 
 
-def evaluations(run: Run, name: str) -> Curve:
-    """An entry of the evaluations of all seeds of a run, as in `Group.curve`."""
-    return _group(run).curve(name)
-
-
-def _group(run: Run) -> Group:
-    return Group(task_of(run), run.config["agent"], [(run, seed) for seed in run.seeds])
+def _write(figure: Any, path: pathlib.Path) -> None:
+    content = io.BytesIO()
+    figure.savefig(content, format=path.suffix[1:], dpi=150)
+    try:
+        write_whole(path, content.getvalue())
+    except OSError as error:
+        raise UserError(f"{path} cannot be written ({cause(error)}): choose another file.") from None
 
 
 def axis_label(measure: str) -> str:
@@ -89,17 +85,25 @@ def standard_error(seeds: np.ndarray) -> np.ndarray:
     return np.where(count > 1, np.sqrt(squares / np.maximum(count - 1, 1) / np.maximum(count, 1)), 0.0)
 
 
-def draw_curve(run: Run, path: pathlib.Path | str | None = None) -> pathlib.Path:
+def draw_curve(run: Run | str | os.PathLike[str], path: str | os.PathLike[str] | None = None) -> pathlib.Path:
     """Draw a run's evaluation returns over environment steps; returns the path of the picture.
 
     Each measure of the task, such as success, has another panel. Each seed is a thin line, the mean a thick
-    line, and the S.E.M. a band. Without `path` the picture is curve.png in the run's folder.
+    line, and the S.E.M. a band.
+
+    Args:
+        run: a run, or its folder.
+        path: the PNG; None: curve.png in the run's folder. An existing file is replaced.
 
     Raises:
-        UserError: there is no evaluation yet.
+        UserError: there is no such run, there is no evaluation yet, or the file cannot be written.
     """
+    run = run if isinstance(run, Run) else Run(run)
     path = pathlib.Path(path or run.folder / "curve.png")
-    curve_figure(run).savefig(path, dpi=150)
+    if path.suffix.lower() != KINDS[0]:
+        raise UserError(f"{path} is impossible: the curve is written as .png, so its name must end in it.")
+    check_folder(path)
+    _write(curve_figure(run), path)
     return path
 
 
@@ -109,7 +113,7 @@ def curve_figure(run: Run) -> Any:
     Raises:
         UserError: there is no evaluation yet.
     """
-    group = _group(run)
+    group = Group(task_of(run), run.config["agent"], [(run, seed) for seed in run.seeds])
     if not group.curve("sampled").steps.size:
         raise UserError(f"{run.folder} has no evaluation of every seed yet, so there is no curve to draw.")
     panels = ["", *group.measures]

@@ -68,7 +68,9 @@ class FoundRuns(NamedTuple):
     damage: list[str]  # one sentence for each unreadable run and for each log with damaged lines
 
 
-def find(paths: Sequence[str | os.PathLike[str]], read: Callable[[pathlib.Path], Run] = Run) -> FoundRuns:
+def find(
+    paths: Sequence[str | os.PathLike[str]] | str | os.PathLike[str], read: Callable[[pathlib.Path], Run] = Run
+) -> FoundRuns:
     """The runs at these paths: a path is a run, a folder with runs at any depth, or a file of results.
 
     A run that cannot be read is left out. `read` makes a run from its folder.
@@ -79,7 +81,8 @@ def find(paths: Sequence[str | os.PathLike[str]], read: Callable[[pathlib.Path],
     found: dict[pathlib.Path, Run] = {}
     unreadable: dict[pathlib.Path, str] = {}
     logs: list[str] = []
-    for path in map(pathlib.Path, paths):
+    given = [paths] if isinstance(paths, str | os.PathLike) else paths
+    for path in map(pathlib.Path, given):
         if path.name.endswith(results.ENDING):
             found |= {run.folder: run for run in results.read(path)}
             continue

@@ -5,6 +5,7 @@ No file is left half written.
 
 import math
 import pathlib
+import re
 from collections.abc import Sequence
 from datetime import datetime
 from typing import NamedTuple
@@ -12,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from beliefrl.analysis.aggregate import known_bounds
-from beliefrl.analysis.figures import standard_error
+from beliefrl.analysis.figures import check_folder, standard_error
 from beliefrl.analysis.groups import Curve, Group, last_step
 from beliefrl.analysis.panels import counts
 from beliefrl.runs import arrays
@@ -50,7 +51,7 @@ def latex(columns: Sequence[Column], rows: Sequence[Cells]) -> str:
     """The table in LaTeX; it needs the package booktabs."""
 
     def line(cells: Cells) -> str:
-        kept = (cell.replace("_", r"\_").replace("%", r"\%").replace("±", r"$\pm$") for cell in cells)
+        kept = (re.sub("[_%#&]", r"\\\g<0>", cell).replace("±", r"$\pm$") for cell in cells)
         return "    " + " & ".join(kept) + r" \\"
 
     alignment = "".join("r" if column.is_number else "l" for column in columns)
@@ -65,6 +66,7 @@ def write_table(columns: Sequence[Column], rows: Sequence[Cells], out: pathlib.P
     Raises:
         UserError: the files cannot be written.
     """
+    check_folder(out)
     try:
         write_whole(out.with_suffix(".tex"), latex(columns, rows).encode())
         write_whole(out.with_suffix(".md"), markdown(columns, rows).encode())
@@ -100,8 +102,8 @@ def final_rows(groups: Sequence[Group]) -> list[tuple[str, ...]]:
         seconds = sum(known) / sum(len(run.seeds) for run in group.runs) if len(known) == len(spans) else None
         table.append(
             (
-                f"`{group.task}`",
-                f"`{group.label}`",
+                group.task,
+                group.label,
                 counts([seed for _, seed in group.seeds]),
                 f"{sampled.steps[-1]:,}",
                 _final(sampled) + _measures(group, "sampled"),

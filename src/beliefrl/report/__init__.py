@@ -25,7 +25,7 @@ from beliefrl.types import UserError, cause
 
 
 def write_report(
-    paths: Sequence[str | os.PathLike[str]],
+    paths: Sequence[str | os.PathLike[str]] | str | os.PathLike[str],
     out: str | os.PathLike[str] = "report.html",
     unfinished: bool = False,
     note: Callable[[str], None] | None = None,
@@ -35,7 +35,7 @@ def write_report(
     Runs that cannot be read and damaged lines of logs are left out. The page lists them.
 
     Args:
-        paths: runs, folders with runs at any depth, and files of results, NAME.json.gz.
+        paths: folders of runs, folders with runs at any depth, and files of results, NAME.json.gz; or one of them.
         out: the page, NAME.html. Its links to videos and pictures are relative to its folder.
         unfinished: whether curves and tables include unfinished runs.
         note: called with one sentence for each unreadable run, and for each log with damaged lines.
@@ -45,7 +45,7 @@ def write_report(
     """
     out = pathlib.Path(out)
     if out.suffix not in (".html", ".htm"):
-        raise UserError(f"{out} must end in .html: give {out.with_suffix('.html')}, for example.")
+        raise UserError(f"{out} must end in .html, such as report.html.")
     if not os.path.isdir(out.parent):  # noqa: PTH112 - pathlib's version raises if a name is too long
         raise UserError(
             f"There is no folder {out.parent} to write {out.name} into: create it, or choose another --out."

@@ -17,7 +17,7 @@ class Options:
     """Where a training starts and ends, and how it is evaluated and saved."""
 
     steps: int = 20_000
-    """Environment steps of each seed, rounded up to whole cycles of the agent."""
+    """Environment steps of each seed, rounded up to whole cycles of the agent (with `envs`: to whole rounds)."""
     seeds: int = 1
     """Number of seeds. They are trained side by side in one program."""
     seed: int = 0

@@ -47,7 +47,7 @@ def is_complete(config: Any) -> bool:
     if not ({"seed", "seeds"} <= config["options"].keys() and isinstance(config.get("observe"), list | None)):
         return False
     resumed = config.get("resumed", [])
-    if not isinstance(config.get("faults", {}), dict):
+    if not all(isinstance(config.get(name, {}), dict) for name in ("faults", "initial")):
         return False
     return isinstance(resumed, list) and all(map(_is_session, [config, *resumed]))
 
@@ -78,8 +78,8 @@ def lines(log: pathlib.Path) -> Iterator[tuple[int, Row | None]]:
         raise UserError(f"{log} cannot be read ({cause(error)}): restore it from a copy.") from None
 
 
-def last_rows(log: pathlib.Path, size: int = 32_768) -> list[Row]:
-    """The entries in the last `size` bytes of a log; damaged ones are left out.
+def last_rows(log: pathlib.Path) -> list[Row]:
+    """The entries in the last 32 KiB of a log; damaged ones are left out.
 
     Raises:
         UserError: the log cannot be read.
@@ -88,7 +88,7 @@ def last_rows(log: pathlib.Path, size: int = 32_768) -> list[Row]:
         return []
     try:
         with log.open("rb") as file:
-            start = max(0, log.stat().st_size - size)
+            start = max(0, log.stat().st_size - 32_768)
             file.seek(start)
             parts = file.read().decode(errors="replace").split("\n")
     except OSError as error:

@@ -149,7 +149,8 @@ class Cluster:
     def room(self) -> int:
         """How many trainings can be started now. It may grow with the cluster."""
         total = self._ray.cluster_resources().get("GPU" if self.has_gpus else "CPU", 0)
-        return int(min(total, self._workers or total)) - len(self._running)
+        most = 1 if self._workers == 0 else self._workers or total
+        return int(min(total, most)) - len(self._running)
 
     def start(self, training: Training) -> None:
         log = self.sweep / "logs" / f"{training.name}.log"

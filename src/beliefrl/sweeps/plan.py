@@ -48,6 +48,11 @@ class Experiment:
     constants: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """The task's constants, as in `make_task`."""
 
+    def __post_init__(self) -> None:
+        """Refuse a number of seeds with a UserError."""
+        if isinstance(self.seeds, int):
+            raise UserError(f"seeds={self.seeds} is impossible: give the seed numbers, such as (0, 1, 2), or use grid.")
+
 
 @dataclasses.dataclass(frozen=True)
 class Training:
@@ -107,7 +112,13 @@ def grid(
         settings: the values to try, for each hyperparameter, training option or fault of the sensors.
         seeds: the number of seeds, counted from 0, or a list of seed numbers.
         fixed: settings with one value.
+
+    Raises:
+        UserError: the values of a setting are not a list.
     """
+    for name, value in (settings or {}).items():
+        if isinstance(value, str) or not isinstance(value, Iterable):
+            raise UserError(f"{name}={value} is not a list of values: give [{value!r}], or {name}= as an argument.")
     names, values = list(settings or {}), list((settings or {}).values())
     numbers = range(seeds) if isinstance(seeds, int) else seeds
     return [

@@ -57,8 +57,8 @@ class SweepProgress:
             self._first_step = 0
             return  # its folder does not exist yet
         updates = [row["step"] for row in rows if row["kind"] == "update"]
-        if self._first_step is None:
-            self._first_step = max(updates, default=0)
+        last = max(updates, default=0)
+        first = self._first_step = last if self._first_step is None else self._first_step
         for row in rows:
             if row["kind"] == "pretrain":
                 self.doing = f"pre-training, {row['step']:,} updates"
@@ -66,7 +66,7 @@ class SweepProgress:
             self.step = max(self.step, row["step"])
             if row["kind"] == "evaluation":
                 self.last_return = statistics.fmean(row["sampled"])
-        if max(updates, default=0) > self._first_step:
+        if last > first:
             self.doing = "learning"
             self._learns_since = self._learns_since or (time.monotonic(), self.step)
 

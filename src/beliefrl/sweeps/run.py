@@ -14,7 +14,7 @@ from beliefrl.sweeps import plan as plans
 from beliefrl.sweeps.plan import Experiment, Training
 from beliefrl.sweeps.progress import SweepDisplay, SweepStatus
 from beliefrl.training.stop import Requests, Stopped
-from beliefrl.types import UserError, cause, one_line
+from beliefrl.types import UserError, cause, check_whole, one_line
 
 LOOK_EVERY = 0.5  # seconds
 ALL = 10_000  # seeds in one run, more than any experiment has
@@ -49,7 +49,7 @@ def sweep(
         experiments: `beliefrl.grid(...)`, or a list of `beliefrl.Experiment`. Empty: continue the sweep in `out`.
         out: the sweep's folder. Finished trainings in it are not repeated, stopped ones continue.
         workers: most trainings at a time, one per core or GPU. None: as many as there are cores or GPUs. 0: one at a
-            time, with all cores.
+            time, with all cores (on a Ray cluster: one at a time).
         seeds_per_run: most seeds side by side in one program. None: all on a GPU, the fastest number on a CPU.
         ray: address of the head of a Ray cluster (HOST:PORT, or "auto"). None: run on this machine.
         report: called twice a second with the state of the sweep.
@@ -60,6 +60,10 @@ def sweep(
             sweep; or a training has failed (raised after all others have ended).
         Stopped: Ctrl-C or SIGTERM, after every training has written a checkpoint. It is a KeyboardInterrupt.
     """
+    if isinstance(experiments, Experiment) or not all(isinstance(each, Experiment) for each in experiments):
+        raise UserError("experiments must be a list of beliefrl.Experiment: beliefrl.grid makes one.")
+    check_whole("workers", 0 if workers is None else workers, 0)
+    check_whole("seeds_per_run", 1 if seeds_per_run is None else seeds_per_run, 1)
     folder = pathlib.Path(out)
     plans.plan(experiments)  # raise errors before a folder is made
     with lock(folder):

@@ -2,7 +2,7 @@
 
 import dataclasses
 import difflib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import jax.numpy as jnp
@@ -17,19 +17,19 @@ from beliefrl.imports import declared, declared_name, load, load_declared, path
 from beliefrl.tasks import registered
 from beliefrl.tasks.faults import NONE, Faults, faults_of, with_faults, without_faults
 from beliefrl.tasks.gymnasium import GymnasiumTask
-from beliefrl.types import Spec, UserError, check_indices, said, tuples
+from beliefrl.types import Spec, UserError, check_indices, said, short, tuples
 
 
 @runtime_checkable
 class Task(Protocol):
     """A frozen dataclass of physical constants with pure methods. It does not reset itself, nor apply its time limit.
 
-    `rollout` truncates episodes at `spec.max_steps` and resets them. Two members are optional. A task that can be
-    rendered has a method `draw(states)`, which returns the `drawing.Picture` of an episode's states so far. A task may
-    have `entry_names`, a tuple with the name of each entry of its observation, followed by the unit in brackets, for
-    the labels in figures: ("cos θ", "sin θ", "θ̇ (rad/s)"). If `spec.measures` names numbers that are recorded for each
-    episode, such as "success" or a distance, a method `measures(state)` returns them by name. Their values at the last
-    state are recorded.
+    `rollout` truncates episodes at `spec.max_steps` and resets them. Other members are optional. A task that can be
+    rendered has a method `draw(states)`, which returns the `drawing.Picture` of an episode's states so far.
+    `entry_names` is a tuple with the name of each entry of its observation, followed by the unit in brackets, for
+    figures: ("cos θ", "sin θ", "θ̇ (rad/s)"). VELOCITIES and POSITIONS are the indices that its versions -v and -p
+    show. If `spec.measures` names numbers such as "success", a method `measures(state)` returns them by name. Their
+    values at the last state of an episode are recorded.
     """
 
     @property
@@ -84,10 +84,11 @@ def observe(task: Any, indices: tuple[int, ...]) -> Any:
     """
     if faults_of(task) != NONE:
         raise UserError("The task has faults already: select the entries first, then add the faults (with_faults).")
-    size = task.spec.obs_dim
-    check_indices(indices, size)
+    if not hasattr(task, "spec"):
+        raise UserError(f"{short(task)} is no task: give one that make_task has made, or one of your own.")
+    check_indices(indices, task.spec.obs_dim)
     if isinstance(task, GymnasiumTask):
-        seen = range(size) if task.indices is None else task.indices
+        seen = range(task.spec.obs_dim) if task.indices is None else task.indices
         return dataclasses.replace(task, indices=tuple(seen[i] for i in indices))
     if isinstance(task, Observed):  # one selection: `describe` records one
         return Observed(task.task, tuple(task.indices[i] for i in indices))
@@ -195,7 +196,7 @@ def make(
     """
     task = _make(name, constants)
     task = task if observe is None else observed(name, task, observe)
-    return with_faults(task, Faults.of(faults))
+    return with_faults(task, faults)
 
 
 def _make(name: str, constants: dict[str, Any]) -> Any:
@@ -252,7 +253,7 @@ def observed(name: str, task: Any, entries: Sequence[int | str] | int | str) -> 
 
 def _indices(name: str, task: Any, observe: Sequence[int | str] | int | str) -> tuple[int, ...]:
     """The indices that `observe` selects for a task."""
-    given = [observe] if isinstance(observe, str | int) else list(observe)
+    given = list(observe) if isinstance(observe, Iterable) and not isinstance(observe, str) else [observe]
     if len(given) == 1 and given[0] in MASKS.values():
         known: Any = KNOWN.get(name.removeprefix(PREFIX), ROBOTS.get(name))
         velocities, positions = masks(known or TASKS.get(name) or task)

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.types import LARGEST, Spec, UserError, check_choice, check_range, tuples
+from beliefrl.types import LARGEST, Spec, UserError, check_choice, check_range, short, tuples
 
 LONGEST_DELAY = 10_000
 STREAM = 1_179_406_420  # separates the random numbers of faults from those of the task, which has the same key
@@ -82,6 +82,8 @@ class Faults:
         """
         if isinstance(settings, Faults):
             return settings
+        if not isinstance(settings, Mapping | None):
+            raise UserError(f"faults={short(settings)} is impossible: give Faults(...), or a dictionary of its fields.")
         known = [field.name for field in dataclasses.fields(cls)]
         for name in settings or {}:
             if name not in known:
@@ -191,12 +193,15 @@ class Faulty:
         )
 
 
-def with_faults(task: Any, faults: Faults) -> Any:
+def with_faults(task: Any, faults: Faults | Mapping[str, Any] | None) -> Any:
     """The same task with missing and faulty sensors; without any faults, the task itself.
 
+    `faults` may also be a dictionary, such as {"noise": 0.1}.
+
     Raises:
-        UserError: the task has faults already, or the noise does not fit its observation.
+        UserError: the task has faults already, there is no such fault, or the noise does not fit its observation.
     """
+    faults = Faults.of(faults)
     if faults == NONE:
         return task
     if faults_of(task) != NONE:

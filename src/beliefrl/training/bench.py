@@ -54,22 +54,22 @@ class Noise:
         return (), jax.random.normal(key, (self.obs_dim,)), jnp.mean(action), jnp.array(False)
 
 
-def median_seconds(call: Callable[[], Any], repeats: int = REPEATS) -> float:
+def median_seconds(call: Callable[[], Any]) -> float:
     """The median time of a call after a first one; waits for the results."""
     jax.block_until_ready(call())
     times = []
-    for _ in range(repeats):
+    for _ in range(REPEATS):
         before = time.perf_counter()
         jax.block_until_ready(call())
         times.append(time.perf_counter() - before)
     return statistics.median(times)
 
 
-def matmul_gflops(size: int = 2048) -> float:
+def matmul_gflops() -> float:
     """The machine's measured rate of a large float32 matrix product, in GFLOP/s."""
-    matrix = jax.random.normal(jax.random.key(0), (size, size))
+    matrix = jax.random.normal(jax.random.key(0), (2048, 2048))
     product = jax.jit(lambda a: a @ a)
-    return 2 * size**3 / median_seconds(lambda: product(matrix)) / 1e9
+    return 2 * matrix.shape[0] ** 3 / median_seconds(lambda: product(matrix)) / 1e9
 
 
 def parameters(tree: Any) -> int:

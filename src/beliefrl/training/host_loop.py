@@ -12,7 +12,8 @@ round are then chosen with the weights from before the updates of the round befo
 on how long a step or an update takes. The first round of a stretch acts with the newest weights. So what is learned
 depends on how the steps are divided into stretches, for instance on `eval_every`.
 
-If an environment fails, the training ends. What was learned and recorded until then is saved.
+If an environment fails, the training ends. What was learned and recorded until then is saved. During the exploration
+nothing is learned, and only the log is saved.
 """
 
 import ctypes

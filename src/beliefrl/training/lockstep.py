@@ -197,12 +197,12 @@ def _pays(task: GymnasiumTask, lanes: int) -> bool:
     return cores > 1 and lanes * step_seconds(task) * (1 - 1 / cores) > HANDOVER
 
 
-def step_seconds(task: GymnasiumTask, steps: int = 20) -> float:
-    """The median time of a step with random actions; 0 if it cannot be measured."""
+def step_seconds(task: GymnasiumTask) -> float:
+    """The median time of 20 steps with random actions; 0 if it cannot be measured."""
     try:
         environment = task.environment()
         environment.reset(seed=0)
-        actions = np.random.default_rng(0).uniform(-1, 1, (steps, task.spec.action_dim))
+        actions = np.random.default_rng(0).uniform(-1, 1, (20, task.spec.action_dim))
         times = []
         for action in actions:
             before = time.perf_counter()

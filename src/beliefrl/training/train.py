@@ -66,10 +66,10 @@ def train(
     Raises:
         UserError: an unknown name or option, an impossible value, `out` exists (with `resume`: and was trained with
             other settings), a tracker cannot be opened, the disk is full, or a Gymnasium environment fails. Then
-            everything until that step is saved.
+            everything until that step is saved, unless nothing was learned yet.
         Stopped: Ctrl-C or SIGTERM, after a checkpoint is written; `resume` continues. It is a KeyboardInterrupt.
     """
-    agent = agents.make(agent) if isinstance(agent, str) else agent
+    agent = agents.given(agent)
     made: Any = given(task)
     chosen = _chosen(options)
     _ = capacity(agent, chosen), made.spec  # raise before the folder is made

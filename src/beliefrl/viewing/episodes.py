@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Int, UInt8
 
 from beliefrl.agents import Agent
 from beliefrl.analysis.tables import measure_text
@@ -138,7 +138,7 @@ def play(
     episode_seed: int = 0,
     sampled: bool = False,
     steps: int | None = None,
-    at: Container[int] = (),
+    at: Container[int] | Int[np.ndarray, "_"] = (),
     task: Task | GymnasiumTask | type | None = None,
     agent: Agent | type | None = None,
     best: bool = False,
@@ -161,6 +161,7 @@ def play(
         UserError: there is no such run or seed, a number is impossible, or the task fails or cannot be rendered.
     """
     check_episode(episode_seed, steps)
+    at = at.tolist() if isinstance(at, np.ndarray) else at
     with Player(*restore_seed(run, seed, task, agent, best), rendered=bool(at)) as player:
         return player.play(episode_seed, sampled, steps, at)
 

@@ -73,7 +73,7 @@ def video(
     check_episode(episode_seed, steps)
     check_whole("episodes", episodes, 1)
     for name, rate in {"fps": fps, "fastest": fastest}.items():
-        if rate is not None and not 0 < rate <= 1000:
+        if rate is not None and not (isinstance(rate, float | int) and 0 < rate <= 1000):
             raise UserError(f"{name}={rate} is impossible: it must be a number above 0 and up to 1000.")
     show = _window if path is None else functools.partial(_encoder, pathlib.Path(path), kind_of(pathlib.Path(path)))
     with Player(*restore_seed(run, seed, task, agent, best), rendered=True) as player:
@@ -209,7 +209,7 @@ def _reduced(image: Image.Image) -> Image.Image:
 
 
 def film(
-    runs: Sequence[Run | str | os.PathLike[str]],
+    runs: Sequence[Run | str | os.PathLike[str]] | Run | str | os.PathLike[str],
     path: str | os.PathLike[str] | None = None,
     frames: int = 8,
     seed: int | None = None,
@@ -226,7 +226,7 @@ def film(
     The step is written below each frame. Writes a PNG and a PDF; returns the path of the PNG.
 
     Args:
-        runs: runs, or their folders.
+        runs: runs or their folders, or one of them.
         path: the PNG or the PDF; None: film.png in the first run's folder.
         frames: number of frames in a row.
         seed: one of each run's seeds; None: its first.
@@ -249,7 +249,8 @@ def film(
         raise UserError(f"start={start} is impossible: it must be less than steps={steps}.")
     if not runs:
         raise UserError("RUN is missing: give one or more runs.")
-    runs = [run if isinstance(run, Run) else Run(run) for run in runs]
+    given = [runs] if isinstance(runs, Run | str | os.PathLike) else runs
+    runs = [run if isinstance(run, Run) else Run(run) for run in given]
     path = pathlib.Path(path or runs[0].folder / "film.png")
     figures.paths(path)
     own = [agent if is_own(run.config["agent"]) else None for run in runs]

@@ -1,0 +1,48 @@
+"""Mistakes in calls from Python are clear sentences, in a process whose types beartype does not check."""
+
+import json
+import subprocess
+import sys
+
+MISTAKES = {
+    "train(VRMAgent, 'pendulum')": "VRMAgent is a class: give an agent, VRMAgent().",
+    "train(5, 'pendulum')": "int is no agent",
+    "make_agent(VRMAgent)": "is not the name of an agent: make_agent takes a name",
+    "make_task('pendulum', observe=1.5)": "observe=1.5 cannot be understood",
+    "make_task('pendulum', faults=0.1)": "faults=0.1 is impossible: give Faults(...), or a dictionary of its fields.",
+    "with_faults(make_task('pendulum'), {'nose': 0.1})": "There is no fault 'nose'",
+    "observe('pendulum', (1,))": "'pendulum' is no task",
+    "observe(make_task('pendulum'), 1)": "observe=1 is not a list of indices: give (1,).",
+    "Experiment('vrm', 'pendulum', seeds=3)": "seeds=3 is impossible: give the seed numbers",
+    "grid(['vrm'], ['pendulum'], {'lr_critic': 3e-4})": "lr_critic=0.0003 is not a list of values: give [0.0003]",
+    "sweep(Experiment('vrm', 'pendulum'), 'out')": "experiments must be a list of beliefrl.Experiment",
+    "sweep(['vrm'], 'out')": "experiments must be a list of beliefrl.Experiment",
+    "sweep([Experiment('vrm', 'pendulum')], 'out', workers=-9)": "workers=-9 is impossible",
+    "sweep([Experiment('vrm', 'pendulum')], 'out', seeds_per_run=0)": "seeds_per_run=0 is impossible",
+    "video('missing', 'video.gif', fps='5')": "fps=5 is impossible",
+    "film('missing')": "no run folder missing",
+    "draw_curve('missing')": "no run folder missing",
+    "write_report('missing')": "There is no folder missing",
+}
+
+CALLS = """
+import json, sys
+from beliefrl import *
+from beliefrl import UserError, observe
+from beliefrl.agents.vrm import VRMAgent
+for call, phrase in json.load(sys.stdin).items():
+    try:
+        eval(call)
+    except UserError as error:
+        assert phrase in str(error), f"{call}: {error}"
+    else:
+        raise AssertionError(call)
+"""
+
+
+def test_mistakes_in_calls_are_sentences(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", CALLS], input=json.dumps(MISTAKES), cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert not list(tmp_path.iterdir())
