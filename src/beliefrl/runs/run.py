@@ -3,7 +3,8 @@
     config.json           agent, task, options, versions, git commit, command line
     metrics/seed-0.jsonl  one line for each entry: {"step", "kind": "update" | "episode" | "evaluation", ...}
     tensorboard/seed-0/   the same entries as TensorBoard events
-    agent.safetensors     the agents of all seeds at the last evaluation (leading axis: seed); plain arrays, no code
+    agent.safetensors     the agents of all seeds (leading axis) at the last evaluation, or at the step at which an
+                          environment failed; plain arrays, no code
     best.safetensors      the same at the evaluation with the highest return of each seed
     initial.safetensors   the networks of all seeds before the first step, if they come from another run
     results.json          the returns of the last evaluation
