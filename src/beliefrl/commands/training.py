@@ -44,7 +44,7 @@ class CheckOptions:
 
 @dataclasses.dataclass(frozen=True)
 class ResumeOptions:
-    """Continue a training from its last checkpoint, or from step 0 if it has no checkpoint yet."""
+    """Continue a training from its last checkpoint, or from step 0 if it has none yet. Other settings cannot change."""
 
     run: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="RUN")]
     """The run's folder."""

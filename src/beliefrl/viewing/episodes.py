@@ -138,7 +138,7 @@ def play(
     episode_seed: int = 0,
     sampled: bool = False,
     steps: int | None = None,
-    at: Container[int] | Int[np.ndarray, "_"] = (),
+    at: Container[int] | Int[np.ndarray, " _"] = (),
     task: Task | GymnasiumTask | type | None = None,
     agent: Agent | type | None = None,
     best: bool = False,
