@@ -106,8 +106,8 @@ class PredictiveSACAgent(ControllerAgent):
     """Hidden layers of each Q."""
     normalise_critics: bool = True
     """Layer normalisation, without gains, before each activation of the Q networks (Ba et al. 2016)."""
-    critic_classes: int = 1
-    """Fixed numbers over which a Q network gives a distribution (`models.two_hot`). With 1, it gives Q itself."""
+    critic_beta: float = 1.0
+    """β of the loss of Q, in [0, 1]: 1 is the squared error; below 1 a Q network also gives σ; 0 is the likelihood."""
     actor_regulariser: float = 1e-3
     """Weight of half the mean square of the policy's μ in the actor's loss."""
 
@@ -146,8 +146,7 @@ class PredictiveSACAgent(ControllerAgent):
 
     ranges = ControllerAgent.ranges | {
         "updates_per_step": (1, 2, 4),
-        "normalise_critics": (False, True),
-        "critic_classes": (1, 101),
+        "critic_beta": (0.0, 0.5, 1.0),
         "batch_size": (64, 128, 256, 512),
         "trace_decay": Range(0.8, 1.0),
         "pessimism": Range(0.0, 1.0),
@@ -165,11 +164,11 @@ class PredictiveSACAgent(ControllerAgent):
         """Refuse impossible values with a UserError."""
         super().__post_init__()
         check_range(self, ("updates_per_step", "batch_size", "lr_model_updates", "seq_len", "sequences", "pool"), 1)
-        check_range(self, ("d_size", "hidden_size", "critic_classes"), 1, WIDEST)
+        check_range(self, ("d_size", "hidden_size"), 1, WIDEST)
         check_range(self, ("pretrain_updates",), 0)
         check_range(self, ("alpha_start",), 1e-6)
         check_range(self, ("lr_model", "lr_model_min", "jump"), 0, 1)
-        check_range(self, ("long_memories", "trace_decay", "off_policy_trace", "pessimism"), 0, 1)
+        check_range(self, ("long_memories", "trace_decay", "off_policy_trace", "pessimism", "critic_beta"), 0, 1)
         check_range(self, ("average_rate",), 1e-6, 1)
         check_range(self, ("longest_memory", "reward_memory") if self.reward_memory else ("longest_memory",), 1)
 
@@ -200,7 +199,7 @@ class PredictiveSACAgent(ControllerAgent):
         sizes = spec.obs_dim, spec.action_dim, len(self.reward_memory)
         model = init_model(key_model, *sizes, self.d_size, self.hidden_size, self.long_memories, self.longest_memory)
         belief = self.d_size + spec.obs_dim + spec.action_dim + 1
-        settings = self.policy_layers, self.value_layers, self.alpha_start, self.normalise_critics, self.critic_classes
+        settings = self.policy_layers, self.value_layers, self.alpha_start, self.normalise_critics, self.critic_beta < 1
         controller = double_q.init_controller(key_controller, belief, spec.action_dim, *settings)
         return State(
             model,
@@ -295,6 +294,7 @@ class PredictiveSACAgent(ControllerAgent):
     def update(self, state: State, batch: Samples, key: Key[Array, ""]) -> tuple[State, Metrics]:
         given = self.optimisers, state.controller_optimiser, state.controller, batch, key
         settings = {"tau": self.tau, "regulariser": self.actor_regulariser, "pessimism": self.pessimism}
+        settings |= {"beta": self.critic_beta}
         controller, optimiser, metrics = double_q.update(*given, **settings, target_entropy=self.target_entropy)
         followed = average.follow(state.average, (state.model, controller.actor), self.average_rate)
         return state._replace(controller=controller, controller_optimiser=optimiser, average=followed), metrics

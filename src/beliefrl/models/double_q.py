@@ -6,7 +6,8 @@ Source: Haarnoja et al. 2019, Algorithm 1, with λ-returns as the targets (`retu
     V̄(s) = Q̄_low(s, ã)
     y_t  = r_t + γ (1 - terminated) ((1 - c_{t+1}) V̄(s_{t+1}) + c_{t+1} y_{t+1})
     c_t  = λ (ω + (1 - ω) min(1, π(a_t|s_t) / b(a_t|s_t)))
-    J_Q  = E ½ ((Q_i(s, a) - y) / u)²,  summed over i; with classes the cross-entropy of Q_i / u to y / u (`two_hot`)
+    J_Q  = E ½ ((Q_i(s, a) - y) / u)²,  summed over i (β = 1)
+         = E σ_i^2β (½ ((Q_i(s, a) - y) / u)² / σ_i² + log σ_i),  summed over i (β < 1)
     J_π  = E α log π(ã|s) - Q_low(s, ã) / u  +  regulariser · ½ E μ²
     J_α  = E -log α (log π(ã|s) + H_target)
 
@@ -20,9 +21,12 @@ target with V̄(s), so it is biased where the policies differ.
 
 u is a running root mean square of y. The networks of the critics return Q / u. When u changes, their last layers are
 rescaled, so that Q stays the same (van Hasselt et al. 2016, without their mean). So one learning rate and one
-temperature fit tasks with returns of any size. With classes the last layers are not rescaled. So Q changes with u, and
-must learn the new scale. Departure: y does not contain the entropy. Over a horizon of 200 steps the sum of entropies
-would exceed the rewards of most tasks. And because α is in units of u, u would influence itself.
+temperature fit tasks with returns of any size. Departure: y does not contain the entropy. Over a horizon of 200 steps
+the sum of entropies would exceed the rewards of most tasks. And because α is in units of u, u would influence itself.
+
+With β < 1 a critic also gives σ, the standard deviation of y / u, and learns both by maximum likelihood. So an error
+counts more where y is certain. The factor σ^2β is a constant for the gradient. It brings back a part of the weight of
+uncertain targets, and with β = 1 the gradient of Q is that of the squared error (Seitzer et al. 2022, β-NLL).
 """
 
 import math
@@ -33,7 +37,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.models import two_hot
 from beliefrl.models.nets import MLP, descend, draw, gaussian_log_prob, tanh_gaussian
 from beliefrl.models.returns import lambda_returns
 from beliefrl.models.soft_actor_critic import (
@@ -53,6 +56,7 @@ from beliefrl.types import Timestep
 UNIT_RATE = 1e-3  # smallest weight of a new batch in u², reached after 1 / rate batches
 UNIT_MIN = 1e-4
 ACTION_MAX = 1 - 1e-6  # so that the inverse of tanh is finite
+CRITIC_SIGMA_MIN = 0.02  # of a critic's σ, in units of u
 
 
 class Policy(NamedTuple):
@@ -123,13 +127,13 @@ def init_controller(
     value_layers: tuple[int, ...],
     alpha: float,
     normalise_critics: bool,
-    classes: int,
+    with_sigma: bool,
 ) -> DoubleQController:
     """A new controller for beliefs and actions of these sizes; Q̄ starts as Q, α at `alpha`, u at 1.
 
-    With one class, a critic gives Q / u. With more, it gives logits (`two_hot`).
+    A critic gives Q / u, and `with_sigma` also the σ of β < 1.
     """
-    critic = MLP((belief + action, *value_layers, classes), jax.nn.relu, normalise_critics)
+    critic = MLP((belief + action, *value_layers, 2 if with_sigma else 1), jax.nn.relu, normalise_critics)
     actor, critics = draw(key, (OneTrunkActor(belief, action, policy_layers), (critic, critic)))
     unit = Unit(jnp.ones(()), jnp.zeros(()))
     return DoubleQController(actor, critics, jax.tree.map(jnp.copy, critics), jnp.full((), math.log(alpha)), unit)
@@ -144,11 +148,6 @@ def sample(
     return action, log_prob, policy
 
 
-def has_classes(critics: tuple[MLP, MLP]) -> bool:
-    """Whether the critics give logits (`two_hot`), and not Q / u."""
-    return len(critics[0].layers[-1].bias) > 1
-
-
 def q_low(
     critics: tuple[MLP, MLP],
     belief: Float[Array, "batch belief"],
@@ -156,8 +155,7 @@ def q_low(
     pessimism: float,
 ) -> Float[Array, " batch"]:
     """Q_low(s, a)."""
-    outputs = (q_outputs(critic, belief, action) for critic in critics)
-    one, two = (two_hot.value(each) if has_classes(critics) else each[:, 0] for each in outputs)
+    one, two = (q_outputs(critic, belief, action)[:, 0] for critic in critics)
     return jnp.minimum(one, two) + (1 - pessimism) / 2 * jnp.abs(one - two)
 
 
@@ -208,34 +206,38 @@ def rescale(
 ) -> DoubleQController:
     """The controller with u updated by the valid targets of one more batch, if there are any.
 
-    Q stays the same. With classes Q / u stays the same. Departure: Adam's moments are not rescaled.
+    Q and u σ stay the same (apart from `CRITIC_SIGMA_MIN`). Departure: Adam's moments are not rescaled.
     """
     old, some = controller.unit, jnp.any(valid)
     rate = jnp.where(some, jnp.maximum(1 / (old.batches + 1), UNIT_RATE), 0.0)
     new = Unit(old.square + rate * (valid_mean(y**2, valid) - old.square), old.batches + some)
 
     def rescaled(critic: MLP) -> MLP:
-        return eqx.tree_at(
-            lambda critic: critic.layers[-1], critic, replace_fn=lambda last: jax.tree.map(by_ratio, last)
-        )
+        last, ratio = critic.layers[-1], old.u / new.u
+        is_q = jnp.arange(len(last.bias)) == 0  # the second output is log σ
+        factor, summand = jnp.where(is_q, ratio, 1.0), jnp.where(is_q, 0.0, jnp.log(ratio))
+        new_last = (last.weight * factor[:, None], last.bias * factor + summand)
+        return eqx.tree_at(lambda critic: (critic.layers[-1].weight, critic.layers[-1].bias), critic, new_last)
 
-    def by_ratio(leaf: Array) -> Array:
-        return leaf * (old.u / new.u)
-
-    if has_classes(controller.critics):
-        return controller._replace(unit=new)
     critics, targets = tuple(map(rescaled, controller.critics)), tuple(map(rescaled, controller.targets))
     return controller._replace(critics=critics, targets=targets, unit=new)
 
 
-def q_loss(critics: tuple[MLP, MLP], batch: Samples, unit: Float[Array, ""]) -> Float[Array, ""]:
-    """J_Q of both critics, summed."""
+def q_loss(critics: tuple[MLP, MLP], batch: Samples, unit: Float[Array, ""], beta: float) -> Float[Array, ""]:
+    """J_Q of both critics, summed. With `beta` below 1 the critics must give σ."""
     y = batch.target / unit
-    if not has_classes(critics):
+    if beta == 1:
         return squared_errors(critics, batch.belief, batch.action, y, batch.valid)
     outputs = (q_outputs(critic, batch.belief, batch.action) for critic in critics)
-    one, two = (two_hot.cross_entropy(logits, y) for logits in outputs)
+    one, two = (weighted_nll(each, y, beta) for each in outputs)
     return valid_mean(one + two, batch.valid)
+
+
+def weighted_nll(output: Float[Array, "batch 2"], y: Float[Array, " batch"], beta: float) -> Float[Array, " batch"]:
+    """σ^2β times the negative log likelihood of y; all in units of u. The second output is log σ before the minimum."""
+    variance = CRITIC_SIGMA_MIN**2 + jnp.exp(2 * output[:, 1])
+    nll = 0.5 * ((y - output[:, 0]) ** 2 / variance + jnp.log(variance))
+    return jax.lax.stop_gradient(variance**beta) * nll
 
 
 def actor_loss(
@@ -263,6 +265,7 @@ def update(
     tau: float,
     regulariser: float,
     pessimism: float,
+    beta: float,
     target_entropy: float | None = None,
 ) -> tuple[DoubleQController, OptimiserState, dict[str, Float[Array, ""]]]:
     """One step of every optimiser, then a soft update of Q̄.
@@ -270,7 +273,7 @@ def update(
     `target_entropy` None is minus the number of action dimensions.
     """
     controller = rescale(controller, batch.target, batch.valid)
-    j_q, grad_critics = jax.value_and_grad(q_loss)(controller.critics, batch, controller.unit.u)
+    j_q, grad_critics = jax.value_and_grad(q_loss)(controller.critics, batch, controller.unit.u, beta)
     differentiate = jax.value_and_grad(actor_loss, has_aux=True)
     (j_pi, (q, log_prob)), grad_actor = differentiate(controller.actor, controller, batch, key, regulariser, pessimism)
     entropy = wanted_entropy(batch.action, target_entropy)
