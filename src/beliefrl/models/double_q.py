@@ -104,8 +104,8 @@ class DoubleQController(NamedTuple):
     """Everything that J_Q, J_π and J_α train."""
 
     actor: OneTrunkActor
-    critics: tuple[MLP, MLP]  # Q_1 / u, Q_2 / u, or their logits
-    targets: tuple[MLP, MLP]  # Q̄_1 / u, Q̄_2 / u, or their logits
+    critics: tuple[MLP, MLP]  # Q_1 / u, Q_2 / u; with β < 1 also log σ
+    targets: tuple[MLP, MLP]  # the same of Q̄
     log_alpha: Float[Array, ""]
     unit: Unit
 
