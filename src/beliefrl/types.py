@@ -7,7 +7,7 @@ Axis names in shapes, everywhere: `seed` (one training each), `batch` (windows),
 import dataclasses
 import numbers
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -65,8 +65,8 @@ def _is_number(value: Any, whole: bool) -> bool:
 def check_indices(indices: Sequence[Any], size: int) -> None:
     """Raise a UserError unless `indices` has at least one index of an observation with `size` entries, each once."""
     allowed = f"give indices from 0 to {size - 1}."
-    if isinstance(indices, int):
-        raise UserError(f"observe={indices} is not a list of indices: give ({indices},).")
+    if isinstance(indices, str) or not isinstance(indices, Iterable):
+        raise UserError(f"observe={short(indices)} is not a list of indices: give a tuple, such as (0, 1).")
     for position, index in enumerate(indices):
         if not (_is_number(index, whole=True) and 0 <= index < size):
             has = "1 entry" if size == 1 else f"{size} entries"

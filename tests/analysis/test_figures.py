@@ -76,7 +76,9 @@ def test_the_curve_is_a_picture_in_the_runs_folder(tmp_path):
     assert picture.exists()
 
 
-@pytest.mark.parametrize(("path", "phrase"), [("no/curve.png", "there is no folder"), ("curve.txt", "written as .png")])
+@pytest.mark.parametrize(
+    ("path", "phrase"), [("no/curve.png", "there is no folder"), ("curve.txt", "written as .png or .pdf")]
+)
 def test_a_curve_that_cannot_be_written_is_one_sentence(tmp_path, path, phrase):
     with pytest.raises(UserError, match=phrase):
         draw_curve(a_run(tmp_path, TWO_SEEDS), tmp_path / path)

@@ -211,9 +211,9 @@ def test_scores_are_between_a_random_policy_and_a_good_one(tmp_path):
     np.testing.assert_allclose(second, [50 / 75, 100 / 75])
 
 
-def test_bounds_are_of_a_task_and_its_masked_versions_only():
-    assert known_bounds("pendulum-v") == known_bounds("pendulum-p") == BOUNDS["pendulum"]
-    assert known_bounds("pendulum mass=2.0") is None
+def test_bounds_are_of_a_task_its_masked_versions_and_its_faults():
+    for name in ("pendulum", "pendulum-v", "pendulum-p", "pendulum-v noise=0.1"):
+        assert known_bounds(name) == BOUNDS["pendulum"]
     assert known_bounds("cartpole-swing-up") is None
 
 

@@ -220,8 +220,8 @@ def test_a_continued_training_learns_from_its_first_new_update_on(tmp_path, monk
     run = a_run(tmp_path / training.name, [[]], updates=[(40, {"loss": 1.0})])
     forecast, status = Forecast(tmp_path), SweepStatus([], [waiting], {training.name: training})
     for now[0], step in ((0.0, 40), (20.0, 60), (60.0, 80)):  # 20 s for the start, then 2 s per step
-        row = {"step": step, "kind": "update", "loss": 1.0}
-        (run.folder / "metrics" / "seed-0.jsonl").write_text(json.dumps(row) + "\n")
+        rows = {"step": 50, "kind": "pretrain"}, {"step": step, "kind": "update", "loss": 1.0}
+        (run.folder / "metrics" / "seed-0.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
         forecast.watch(status)
         (progress,) = forecast.going.values()
         assert progress.doing == ("starting" if step == 40 else "learning")

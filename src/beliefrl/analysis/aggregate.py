@@ -79,11 +79,11 @@ def bounds(task: str, final: dict[tuple[str, str], np.ndarray]) -> tuple[float, 
 
 
 def known_bounds(task: str) -> tuple[float, float] | None:
-    """The task's entry in BOUNDS, which also holds for its masked versions; None if there is none.
+    """The task's entry in BOUNDS, which also holds for its masked versions, faults and constants; None without one.
 
-    A task with other constants or with faults has none: `task` then has more words than its name.
+    `task` is its name in figures, of which the first word is the name of the task.
     """
-    return BOUNDS.get(task.removesuffix("-v").removesuffix("-p"))
+    return BOUNDS.get(task.split()[0].removesuffix("-v").removesuffix("-p"))
 
 
 def _normalised(returns: np.ndarray, ends: tuple[float, float]) -> np.ndarray:

@@ -66,7 +66,7 @@ def save(figure: Any, path: pathlib.Path) -> pathlib.Path:
 
 def _write(figure: Any, path: pathlib.Path) -> None:
     content = io.BytesIO()
-    figure.savefig(content, format=path.suffix[1:], dpi=150)
+    figure.savefig(content, format=path.suffix[1:].lower(), dpi=150)
     try:
         write_whole(path, content.getvalue())
     except OSError as error:
@@ -93,15 +93,15 @@ def draw_curve(run: Run | str | os.PathLike[str], path: str | os.PathLike[str] |
 
     Args:
         run: a run, or its folder.
-        path: the PNG; None: curve.png in the run's folder. An existing file is replaced.
+        path: the PNG or PDF; None: curve.png in the run's folder. An existing file is replaced.
 
     Raises:
         UserError: there is no such run, there is no evaluation yet, or the file cannot be written.
     """
     run = run if isinstance(run, Run) else Run(run)
     path = pathlib.Path(path or run.folder / "curve.png")
-    if path.suffix.lower() != KINDS[0]:
-        raise UserError(f"{path} is impossible: the curve is written as .png, so its name must end in it.")
+    if path.suffix.lower() not in KINDS:
+        raise UserError(f"{path} is impossible: a curve is written as .png or .pdf: end its name so.")
     check_folder(path)
     _write(curve_figure(run), path)
     return path

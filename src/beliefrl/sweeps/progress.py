@@ -54,14 +54,14 @@ class SweepProgress:
         try:
             rows = Run(self._path).last_rows(self.training.seeds[0])
         except UserError:
-            self._first_step = 0
+            self._first_step = self._first_step or 0
             return  # its folder does not exist yet
         updates = [row["step"] for row in rows if row["kind"] == "update"]
         last = max(updates, default=0)
         first = self._first_step = last if self._first_step is None else self._first_step
         for row in rows:
             if row["kind"] == "pretrain":
-                self.doing = f"pre-training, {row['step']:,} updates"
+                self.doing = self.doing if first else f"pre-training, {row['step']:,} updates"
                 continue
             self.step = max(self.step, row["step"])
             if row["kind"] == "evaluation":

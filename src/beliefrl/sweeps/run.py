@@ -60,7 +60,7 @@ def sweep(
             sweep; or a training has failed (raised after all others have ended).
         Stopped: Ctrl-C or SIGTERM, after every training has written a checkpoint. It is a KeyboardInterrupt.
     """
-    if isinstance(experiments, Experiment) or not all(isinstance(each, Experiment) for each in experiments):
+    if not isinstance(experiments, Sequence) or not all(isinstance(each, Experiment) for each in experiments):
         raise UserError("experiments must be a list of beliefrl.Experiment: beliefrl.grid makes one.")
     check_whole("workers", 0 if workers is None else workers, 0)
     check_whole("seeds_per_run", 1 if seeds_per_run is None else seeds_per_run, 1)

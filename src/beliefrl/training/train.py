@@ -255,17 +255,17 @@ def _check_same(run: Run, config: dict[str, Any], older: dict[str, Any]) -> None
 
 
 def _check_same_task(run: Run, task: Any) -> None:
-    """Raise a UserError if a run was trained on another task, with other constants, or with other faults.
+    """Raise a UserError if a run was trained on another task, with other faults, or, in JAX, with other constants.
 
     A class may be imported from another module, and the arguments of a Gymnasium environment may differ.
     """
     asked, there = ({"faults": None} | each for each in (tasks.describe(task), run.config))
     same = ("task", "faults") if isinstance(task, GymnasiumTask) else ("task", "faults", "constants")
     for name in same:
-        given, known = (json.loads(json.dumps(each[name], default=str)) for each in (asked, there))
+        ours, theirs = (json.loads(json.dumps(each[name], default=str)) for each in (asked, there))
         if name == "task":
-            given, known = (each.rpartition(":")[2] for each in (given, known))
-        if given != known:
+            ours, theirs = (each.rpartition(":")[2] for each in (ours, theirs))
+        if ours != theirs:
             raise UserError(f"{run.folder} was trained with {name}={there[name]}, not {asked[name]}: give that task.")
 
 

@@ -39,7 +39,7 @@ class Trajectory(NamedTuple):
 
     steps: Timestep  # numpy, leaves (time, ...); prev_action[t] led to reward[t] and obs[t]
     total: float  # undiscounted return
-    measures: dict[str, float | None]  # of the task, such as "success": the last reported values
+    measures: dict[str, float | None]  # of the task, such as "success": the last reported; None if not finite
     frames: dict[int, Pixels]  # the requested frames, by timestep
 
     @property

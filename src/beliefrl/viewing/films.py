@@ -73,8 +73,8 @@ def video(
     check_episode(episode_seed, steps)
     check_whole("episodes", episodes, 1)
     for name, rate in {"fps": fps, "fastest": fastest}.items():
-        if rate is not None and not (isinstance(rate, float | int) and 0 < rate <= 1000):
-            raise UserError(f"{name}={rate} is impossible: it must be a number above 0 and up to 1000.")
+        if rate is not None and (isinstance(rate, str) or not 0 < rate <= 1000):
+            raise UserError(f"{name}={rate!r} is impossible: it must be a number above 0 and up to 1000.")
     show = _window if path is None else functools.partial(_encoder, pathlib.Path(path), kind_of(pathlib.Path(path)))
     with Player(*restore_seed(run, seed, task, agent, best), rendered=True) as player:
         pace = pace_of(player.environment)
