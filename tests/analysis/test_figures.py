@@ -77,7 +77,7 @@ def test_the_curve_is_a_picture_in_the_runs_folder(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("path", "phrase"), [("no/curve.png", "there is no folder"), ("curve.txt", "written as .png or .pdf")]
+    ("path", "phrase"), [("no/curve.png", "there is no folder"), ("curve.txt", "must end in .png or .pdf")]
 )
 def test_a_curve_that_cannot_be_written_is_one_sentence(tmp_path, path, phrase):
     with pytest.raises(UserError, match=phrase):

@@ -107,7 +107,7 @@ class PredictiveSACAgent(ControllerAgent):
     normalise_critics: bool = True
     """Layer normalisation, without gains, before each activation of the Q networks (Ba et al. 2016)."""
     critic_beta: float = 1.0
-    """β of the loss of Q, in [0, 1]: 1 is the squared error; below 1 a Q network also gives σ; 0 is the likelihood."""
+    """β of the loss of Q, from 0 to 1. 1 is the squared error, 0 maximum likelihood. Below 1 Q networks also give σ."""
     actor_regulariser: float = 1e-3
     """Weight of half the mean square of the policy's μ in the actor's loss."""
 

@@ -46,7 +46,7 @@ class SACMLPAgent(SACAgent):
 
     @property
     def window(self) -> WindowShape:
-        """n + 1 timesteps. What is no transition, because an episode ends there, is masked."""
+        """n + 1 timesteps. Two of them are no transition, and are masked, if an episode ends between them."""
         return WindowShape(burn_in=0, length=self.n_step)
 
     @property

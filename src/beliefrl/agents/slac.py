@@ -219,7 +219,7 @@ class SLACAgent(SACAgent):
 
 
 def begin_windows(windows: Window) -> Window:
-    """The windows (time-major), with their first timestep marked as an episode's first, and no action before firsts."""
+    """The windows (time-major), each as the beginning of an episode. First timesteps have no previous action."""
     first = windows.step.is_first.at[0].set(True)
     prev_action = jnp.where(first[..., None], 0.0, windows.step.prev_action)
     return windows._replace(step=windows.step._replace(is_first=first, prev_action=prev_action))

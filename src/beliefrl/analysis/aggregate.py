@@ -79,9 +79,9 @@ def bounds(task: str, final: dict[tuple[str, str], np.ndarray]) -> tuple[float, 
 
 
 def known_bounds(task: str) -> tuple[float, float] | None:
-    """The task's entry in BOUNDS, which also holds for its masked versions, faults and constants; None without one.
+    """The task's entry in BOUNDS, also for its masked versions, and with faults or other constants; None without one.
 
-    `task` is its name in figures, of which the first word is the name of the task.
+    `task` is the task's name in figures. Its first word is the name without faults and constants.
     """
     return BOUNDS.get(task.split()[0].removesuffix("-v").removesuffix("-p"))
 

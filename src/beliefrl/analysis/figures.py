@@ -101,7 +101,7 @@ def draw_curve(run: Run | str | os.PathLike[str], path: str | os.PathLike[str] |
     run = run if isinstance(run, Run) else Run(run)
     path = pathlib.Path(path or run.folder / "curve.png")
     if path.suffix.lower() not in KINDS:
-        raise UserError(f"{path} is impossible: a curve is written as .png or .pdf: end its name so.")
+        raise UserError(f"{path} is impossible: the name of a curve must end in .png or .pdf.")
     check_folder(path)
     _write(curve_figure(run), path)
     return path

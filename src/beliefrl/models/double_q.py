@@ -25,8 +25,8 @@ temperature fit tasks with returns of any size. Departure: y does not contain th
 the sum of entropies would exceed the rewards of most tasks. And because α is in units of u, u would influence itself.
 
 With β < 1 a critic also gives σ, the standard deviation of y / u, and learns both by maximum likelihood. So an error
-counts more where y is certain. The factor σ^2β is a constant for the gradient. It brings back a part of the weight of
-uncertain targets, and with β = 1 the gradient of Q is that of the squared error (Seitzer et al. 2022, β-NLL).
+counts more where y is certain. The factor σ^2β is a constant for the gradient. The larger β is, the more uncertain
+targets count. With β = 1 the gradient of Q is that of the squared error (Seitzer et al. 2022, β-NLL).
 """
 
 import math
@@ -234,7 +234,7 @@ def q_loss(critics: tuple[MLP, MLP], batch: Samples, unit: Float[Array, ""], bet
 
 
 def weighted_nll(output: Float[Array, "batch 2"], y: Float[Array, " batch"], beta: float) -> Float[Array, " batch"]:
-    """σ^2β times the negative log likelihood of y; all in units of u. The second output is log σ before the minimum."""
+    """σ^2β times the negative log likelihood of y, in units of u. The second output is log σ without the minimum."""
     variance = CRITIC_SIGMA_MIN**2 + jnp.exp(2 * output[:, 1])
     nll = 0.5 * ((y - output[:, 0]) ** 2 / variance + jnp.log(variance))
     return jax.lax.stop_gradient(variance**beta) * nll
