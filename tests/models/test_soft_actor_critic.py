@@ -173,9 +173,9 @@ COUNT = 12
 KEY = jax.random.key(0)
 
 
-def make(key=KEY, normalise=False, beta=1.0):
+def make(key=KEY, normalise=False, likelihood=0.0):
     sizes = BELIEF, ACTION, (8, 8), (8, 8)
-    controller = jax.jit(lambda key: double_q.init_controller(key, *sizes, 0.1, normalise, beta < 1))(key)
+    controller = jax.jit(lambda key: double_q.init_controller(key, *sizes, 0.1, normalise, likelihood > 0))(key)
     return controller._replace(unit=Unit(jnp.array(9.0), jnp.array(4.0)))
 
 
@@ -228,9 +228,9 @@ def q_low(one, two, pessimism):
     return pessimism * np.minimum(one, two) + (1 - pessimism) * (one + two) / 2
 
 
-@pytest.mark.parametrize(("pessimism", "beta"), [(1.0, 1.0), (0.25, 1.0), (0.25, 0.0)])
-def test_targets_mix_the_values_of_the_target_networks_by_how_likely_the_actions_are(pessimism, beta):
-    controller, key, time = make(beta=beta), jax.random.key(3), 4
+@pytest.mark.parametrize(("pessimism", "likelihood"), [(1.0, 0.0), (0.25, 0.0), (0.25, 0.1)])
+def test_targets_mix_the_values_of_the_target_networks_by_how_likely_the_actions_are(pessimism, likelihood):
+    controller, key, time = make(likelihood=likelihood), jax.random.key(3), 4
     keys = jax.random.split(jax.random.key(5), 5)
     belief = jax.random.normal(keys[0], (time, 2, BELIEF))
     action = jnp.tanh(jax.random.normal(keys[1], (time, 2, ACTION)))
@@ -267,18 +267,19 @@ def test_an_action_at_the_bound_has_a_finite_likeness():
         np.testing.assert_allclose(double_q.likeness(policy, behaviour, action), expected, atol=1e-6)
 
 
-@pytest.mark.parametrize(("pessimism", "beta"), [(1.0, 1.0), (0.25, 1.0), (1.0, 0.5), (1.0, 0.0)])
-def test_the_losses_are_their_formulas_over_valid_transitions(pessimism, beta):
-    controller, data, key = make(beta=beta), random_batch(), jax.random.key(3)
+@pytest.mark.parametrize(("pessimism", "likelihood"), [(1.0, 0.0), (0.25, 0.0), (1.0, 0.1), (1.0, 10.0)])
+def test_the_losses_are_their_formulas_over_valid_transitions(pessimism, likelihood):
+    controller, data, key = make(likelihood=likelihood), random_batch(), jax.random.key(3)
     valid, y = np.asarray(data.valid), np.asarray(data.target / controller.unit.u)
     expected = 0.0
     for critic in controller.critics:
         error = 0.5 * (q(critic, data.belief, data.action) - y) ** 2
-        if beta < 1:
+        if likelihood > 0:
             s = sigma(critic, data.belief, data.action)
-            error = s ** (2 * beta) * (error / s**2 + np.log(s))
+            error = error + likelihood * (error / s**2 + np.log(s))
         expected += np.mean(error[valid])
-    np.testing.assert_allclose(double_q.q_loss(controller.critics, data, controller.unit.u, beta), expected, rtol=1e-4)
+    j_q = double_q.q_loss(controller.critics, data, controller.unit.u, likelihood)
+    np.testing.assert_allclose(j_q, expected, rtol=1e-4)
 
     j_pi, (low, log_prob) = jax.jit(double_q.actor_loss, static_argnums=(4, 5))(
         controller.actor, controller, data, key, 0.2, pessimism
@@ -291,13 +292,13 @@ def test_the_losses_are_their_formulas_over_valid_transitions(pessimism, beta):
     np.testing.assert_allclose(j_pi, np.mean(expected[valid]), rtol=1e-4)
 
 
-def test_the_gradient_of_q_with_beta_one_is_that_of_the_squared_error():
-    """Below β = 1 an error of a certain target counts more: the gradient of Q is (Q - y) σ^(2 β - 2)."""
-    output, y = jnp.array([[0.5, -1.0], [2.0, 0.5]]), jnp.array([1.0, -1.0])
+def test_an_error_counts_more_where_the_target_is_certain_and_never_less_than_a_squared_error():
+    """The gradient of Q is (Q - y) (1 + w / σ²)."""
+    output, y = jnp.array([[0.5, -1.0], [2.0, 9.0]]), jnp.array([1.0, -1.0])
     variance = double_q.CRITIC_SIGMA_MIN**2 + jnp.exp(2 * output[:, 1])
-    for beta in (0.0, 0.5, 1.0):
-        gradient = jax.grad(lambda output, beta=beta: double_q.weighted_nll(output, y, beta).sum())(output)
-        np.testing.assert_allclose(gradient[:, 0], (output[:, 0] - y) * variance ** (beta - 1), rtol=1e-5)
+    for weight in (0.0, 0.1, 1.0):
+        gradient = jax.grad(lambda output, weight=weight: double_q.q_error(output, y, weight).sum())(output)
+        np.testing.assert_allclose(gradient[:, 0], (output[:, 0] - y) * (1 + weight / variance), rtol=1e-5)
 
 
 def test_the_likelihood_is_highest_at_the_mean_and_the_deviation_of_the_targets():
@@ -306,7 +307,7 @@ def test_the_likelihood_is_highest_at_the_mean_and_the_deviation_of_the_targets(
     @jax.jit
     def learned(output):
         def loss(output):
-            return jnp.mean(double_q.weighted_nll(jnp.broadcast_to(output, (y.size, 2)), y, 0.0))
+            return jnp.mean(double_q.q_error(jnp.broadcast_to(output, (y.size, 2)), y, 1.0))
 
         return jax.lax.fori_loop(0, 2000, lambda _, output: output - 0.05 * jax.grad(loss)(output), output)
 
@@ -314,16 +315,16 @@ def test_the_likelihood_is_highest_at_the_mean_and_the_deviation_of_the_targets(
     np.testing.assert_allclose([mean, jnp.exp(log_sigma)], [y.mean(), y.std()], rtol=1e-2)
 
 
-@pytest.mark.parametrize("beta", [0.0, 1.0])
+@pytest.mark.parametrize("likelihood", [0.0, 0.1])
 @pytest.mark.parametrize("normalise", [False, True])
-def test_a_new_unit_leaves_every_q_as_it_is(normalise, beta):
-    controller, data = make(normalise=normalise, beta=beta), random_batch()
+def test_a_new_unit_leaves_every_q_as_it_is(normalise, likelihood):
+    controller, data = make(normalise=normalise, likelihood=likelihood), random_batch()
     after = jax.jit(double_q.rescale)(controller, 100 * data.target, data.valid)
     assert after.unit.u > 2 * controller.unit.u
     for old, new in zip((*controller.critics, *controller.targets), (*after.critics, *after.targets), strict=True):
         before, now = (q(critic, data.belief, data.action) for critic in (old, new))
         np.testing.assert_allclose(float(after.unit.u) * now, float(controller.unit.u) * before, rtol=1e-4, atol=1e-4)
-        if beta < 1:
+        if likelihood > 0:
             before, now = (np.exp(outputs(critic, data.belief, data.action)[:, 1]) for critic in (old, new))
             np.testing.assert_allclose(float(after.unit.u) * now, float(controller.unit.u) * before, rtol=1e-4)
 
@@ -352,7 +353,7 @@ def test_what_is_learned_does_not_depend_on_the_size_of_rewards(size):
         state = init_optimisers(optimisers, controller)
         for number in range(5):
             key = jax.random.key(number)
-            settings = {"tau": 0.1, "regulariser": 1e-3, "pessimism": 1.0, "beta": 1.0}
+            settings = {"tau": 0.1, "regulariser": 1e-3, "pessimism": 1.0, "likelihood": 0.0}
             controller, state, _ = double_q.update(optimisers, state, controller, data, key, **settings)
         return controller
 
@@ -372,7 +373,7 @@ def test_an_update_moves_the_targets_by_tau_and_ignores_what_is_not_valid():
 
     @jax.jit
     def update(data):
-        settings = {"tau": 0.25, "regulariser": 1e-3, "pessimism": 1.0, "beta": 1.0}
+        settings = {"tau": 0.25, "regulariser": 1e-3, "pessimism": 1.0, "likelihood": 0.0}
         state = init_optimisers(optimisers, controller)
         return double_q.update(optimisers, state, controller, data, KEY, **settings)[0]
 

@@ -106,8 +106,8 @@ class PredictiveSACAgent(ControllerAgent):
     """Hidden layers of each Q."""
     normalise_critics: bool = True
     """Layer normalisation, without gains, before each activation of the Q networks (Ba et al. 2016)."""
-    critic_beta: float = 1.0
-    """β of the loss of Q, from 0 to 1. 1 is the squared error, 0 maximum likelihood. Below 1 Q networks also give σ."""
+    critic_likelihood: float = 0.1
+    """w ≥ 0: weight of the negative log likelihood beside the squared error in the loss of Q. Above 0 Q also has σ."""
     actor_regulariser: float = 1e-3
     """Weight of half the mean square of the policy's μ in the actor's loss."""
 
@@ -136,8 +136,7 @@ class PredictiveSACAgent(ControllerAgent):
     longest_memory: int = 127
     """L: these cells start with forget biases of log U(1, L), which are time constants of 2 to L + 1 steps."""
     reward_memory: tuple[float, ...] = (8.0, 64.0, 512.0)
-    """Time constants, in steps, of the memory of unusual rewards that the LSTM reads. The pre-training determines which
-    rewards are unusual. Without any, there is no memory of rewards."""
+    """Time constants, in steps, of the memory of unusual rewards that the LSTM reads. Without any, it has no memory."""
     pool: int = 8
     """Number of the last cycles whose transitions are in the pool. There are `pool` × `sequences` readers."""
     average_rate: float = 2e-4
@@ -146,7 +145,7 @@ class PredictiveSACAgent(ControllerAgent):
 
     ranges = ControllerAgent.ranges | {
         "updates_per_step": (1, 2, 4),
-        "critic_beta": (0.0, 0.5, 1.0),
+        "critic_likelihood": (0.0, 0.1, 1.0),
         "batch_size": (64, 128, 256, 512),
         "trace_decay": Range(0.8, 1.0),
         "pessimism": Range(0.0, 1.0),
@@ -158,17 +157,17 @@ class PredictiveSACAgent(ControllerAgent):
         "long_memories": Range(0.0, 0.5),
         "pool": (4, 8, 16),
     }
-    values_before = {"normalise_critics": False, "lr_model_min": 1.0, "average_rate": 1.0}  # in runs from before them
+    values_before = {"normalise_critics": False, "lr_model_min": 1.0, "average_rate": 1.0, "critic_likelihood": 0.0}
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
         super().__post_init__()
         check_range(self, ("updates_per_step", "batch_size", "lr_model_updates", "seq_len", "sequences", "pool"), 1)
         check_range(self, ("d_size", "hidden_size"), 1, WIDEST)
-        check_range(self, ("pretrain_updates",), 0)
+        check_range(self, ("pretrain_updates", "critic_likelihood"), 0)
         check_range(self, ("alpha_start",), 1e-6)
-        check_range(self, ("lr_model", "lr_model_min", "jump"), 0, 1)
-        check_range(self, ("long_memories", "trace_decay", "off_policy_trace", "pessimism", "critic_beta"), 0, 1)
+        fractions = "long_memories", "trace_decay", "off_policy_trace", "pessimism"
+        check_range(self, ("lr_model", "lr_model_min", "jump", *fractions), 0, 1)
         check_range(self, ("average_rate",), 1e-6, 1)
         check_range(self, ("longest_memory", "reward_memory") if self.reward_memory else ("longest_memory",), 1)
 
@@ -199,8 +198,9 @@ class PredictiveSACAgent(ControllerAgent):
         sizes = spec.obs_dim, spec.action_dim, len(self.reward_memory)
         model = init_model(key_model, *sizes, self.d_size, self.hidden_size, self.long_memories, self.longest_memory)
         belief = self.d_size + spec.obs_dim + spec.action_dim + 1
-        settings = self.policy_layers, self.value_layers, self.alpha_start, self.normalise_critics, self.critic_beta < 1
-        controller = double_q.init_controller(key_controller, belief, spec.action_dim, *settings)
+        settings = self.policy_layers, self.value_layers, self.alpha_start, self.normalise_critics
+        with_sigma = self.critic_likelihood > 0
+        controller = double_q.init_controller(key_controller, belief, spec.action_dim, *settings, with_sigma)
         return State(
             model,
             controller,
@@ -294,7 +294,7 @@ class PredictiveSACAgent(ControllerAgent):
     def update(self, state: State, batch: Samples, key: Key[Array, ""]) -> tuple[State, Metrics]:
         given = self.optimisers, state.controller_optimiser, state.controller, batch, key
         settings = {"tau": self.tau, "regulariser": self.actor_regulariser, "pessimism": self.pessimism}
-        settings |= {"beta": self.critic_beta}
+        settings |= {"likelihood": self.critic_likelihood}
         controller, optimiser, metrics = double_q.update(*given, **settings, target_entropy=self.target_entropy)
         followed = average.follow(state.average, (state.model, controller.actor), self.average_rate)
         return state._replace(controller=controller, controller_optimiser=optimiser, average=followed), metrics

@@ -6,8 +6,8 @@ Source: Haarnoja et al. 2019, Algorithm 1, with λ-returns as the targets (`retu
     V̄(s) = Q̄_low(s, ã)
     y_t  = r_t + γ (1 - terminated) ((1 - c_{t+1}) V̄(s_{t+1}) + c_{t+1} y_{t+1})
     c_t  = λ (ω + (1 - ω) min(1, π(a_t|s_t) / b(a_t|s_t)))
-    J_Q  = E ½ ((Q_i(s, a) - y) / u)²,  summed over i (β = 1)
-         = E σ_i^2β (½ ((Q_i(s, a) - y) / u)² / σ_i² + log σ_i),  summed over i (β < 1)
+    e_i  = (Q_i(s, a) - y) / u
+    J_Q  = E ½ e_i² + w (½ e_i² / σ_i² + log σ_i),  summed over i
     J_π  = E α log π(ã|s) - Q_low(s, ã) / u  +  regulariser · ½ E μ²
     J_α  = E -log α (log π(ã|s) + H_target)
 
@@ -24,9 +24,9 @@ rescaled, so that Q stays the same (van Hasselt et al. 2016, without their mean)
 temperature fit tasks with returns of any size. Departure: y does not contain the entropy. Over a horizon of 200 steps
 the sum of entropies would exceed the rewards of most tasks. And because α is in units of u, u would influence itself.
 
-With β < 1 a critic also gives σ, the standard deviation of y / u, and learns both by maximum likelihood. So an error
-counts more where y is certain. The factor σ^2β is a constant for the gradient. The larger β is, the more uncertain
-targets count. With β = 1 the gradient of Q is that of the squared error (Seitzer et al. 2022, β-NLL).
+With the weight w > 0 a critic also gives σ, the standard deviation of y / u, and its loss has the negative log
+likelihood of y. So an error counts more where y is certain, for example shortly before an episode ends. The squared
+error bounds how little an error counts where y is uncertain, for example when a reward is rare.
 """
 
 import math
@@ -47,7 +47,6 @@ from beliefrl.models.soft_actor_critic import (
     alpha_loss,
     q_outputs,
     soft_update,
-    squared_errors,
     valid_mean,
     wanted_entropy,
 )
@@ -104,7 +103,7 @@ class DoubleQController(NamedTuple):
     """Everything that J_Q, J_π and J_α train."""
 
     actor: OneTrunkActor
-    critics: tuple[MLP, MLP]  # Q_1 / u, Q_2 / u; with β < 1 also log σ
+    critics: tuple[MLP, MLP]  # Q_1 / u, Q_2 / u; with w > 0 also log σ
     targets: tuple[MLP, MLP]  # the same of Q̄
     log_alpha: Float[Array, ""]
     unit: Unit
@@ -131,7 +130,7 @@ def init_controller(
 ) -> DoubleQController:
     """A new controller for beliefs and actions of these sizes; Q̄ starts as Q, α at `alpha`, u at 1.
 
-    A critic gives Q / u, and `with_sigma` also the σ of β < 1.
+    A critic gives Q / u, and `with_sigma` also the σ of w > 0.
     """
     critic = MLP((belief + action, *value_layers, 2 if with_sigma else 1), jax.nn.relu, normalise_critics)
     actor, critics = draw(key, (OneTrunkActor(belief, action, policy_layers), (critic, critic)))
@@ -223,21 +222,22 @@ def rescale(
     return controller._replace(critics=critics, targets=targets, unit=new)
 
 
-def q_loss(critics: tuple[MLP, MLP], batch: Samples, unit: Float[Array, ""], beta: float) -> Float[Array, ""]:
-    """J_Q of both critics, summed. With `beta` below 1 the critics must give σ."""
-    y = batch.target / unit
-    if beta == 1:
-        return squared_errors(critics, batch.belief, batch.action, y, batch.valid)
+def q_loss(critics: tuple[MLP, MLP], batch: Samples, unit: Float[Array, ""], likelihood: float) -> Float[Array, ""]:
+    """J_Q of both critics, summed. If the weight `likelihood` is not 0, the critics must give σ."""
     outputs = (q_outputs(critic, batch.belief, batch.action) for critic in critics)
-    one, two = (weighted_nll(each, y, beta) for each in outputs)
+    one, two = (q_error(each, batch.target / unit, likelihood) for each in outputs)
     return valid_mean(one + two, batch.valid)
 
 
-def weighted_nll(output: Float[Array, "batch 2"], y: Float[Array, " batch"], beta: float) -> Float[Array, " batch"]:
-    """σ^2β times the negative log likelihood of y, in units of u. The second output is log σ without the minimum."""
+def q_error(
+    output: Float[Array, "batch output"], y: Float[Array, " batch"], likelihood: float
+) -> Float[Array, " batch"]:
+    """J_Q of one critic, before the mean. The second output is log σ without its minimum."""
+    squared = 0.5 * (output[:, 0] - y) ** 2
+    if likelihood == 0:
+        return squared
     variance = CRITIC_SIGMA_MIN**2 + jnp.exp(2 * output[:, 1])
-    nll = 0.5 * ((y - output[:, 0]) ** 2 / variance + jnp.log(variance))
-    return jax.lax.stop_gradient(variance**beta) * nll
+    return squared + likelihood * (squared / variance + 0.5 * jnp.log(variance))
 
 
 def actor_loss(
@@ -265,7 +265,7 @@ def update(
     tau: float,
     regulariser: float,
     pessimism: float,
-    beta: float,
+    likelihood: float,
     target_entropy: float | None = None,
 ) -> tuple[DoubleQController, OptimiserState, dict[str, Float[Array, ""]]]:
     """One step of every optimiser, then a soft update of Q̄.
@@ -273,7 +273,7 @@ def update(
     `target_entropy` None is minus the number of action dimensions.
     """
     controller = rescale(controller, batch.target, batch.valid)
-    j_q, grad_critics = jax.value_and_grad(q_loss)(controller.critics, batch, controller.unit.u, beta)
+    j_q, grad_critics = jax.value_and_grad(q_loss)(controller.critics, batch, controller.unit.u, likelihood)
     differentiate = jax.value_and_grad(actor_loss, has_aux=True)
     (j_pi, (q, log_prob)), grad_actor = differentiate(controller.actor, controller, batch, key, regulariser, pessimism)
     entropy = wanted_entropy(batch.action, target_entropy)

@@ -138,19 +138,8 @@ def q_loss(critics: tuple[MLP, MLP], target_value: MLP, batch: Batch) -> Float[A
     """J_Q of both critics, summed."""
     next_value = jnp.where(batch.terminated, 0.0, state_value(target_value, batch.next_belief))
     target = jax.lax.stop_gradient(batch.reward + batch.discount * next_value)
-    return squared_errors(critics, batch.belief, batch.action, target, batch.valid)
-
-
-def squared_errors(
-    critics: tuple[MLP, MLP],
-    belief: Float[Array, "batch belief"],
-    action: Float[Array, "batch action"],
-    target: Float[Array, " batch"],
-    valid: Bool[Array, " batch"],
-) -> Float[Array, ""]:
-    """E ½ (Q_i(s, a) - target)², summed over both critics."""
-    errors = [q_value(critic, belief, action) - target for critic in critics]
-    return valid_mean(0.5 * errors[0] ** 2 + 0.5 * errors[1] ** 2, valid)
+    errors = [q_value(critic, batch.belief, batch.action) - target for critic in critics]
+    return valid_mean(0.5 * errors[0] ** 2 + 0.5 * errors[1] ** 2, batch.valid)
 
 
 def actor_loss(
