@@ -264,6 +264,18 @@ def test_other_layers_are_one_sentence_and_no_folder(tmp_path, recorded):
     assert not (tmp_path / "run").exists()
 
 
+def test_a_run_from_before_the_likelihood_is_not_continued_with_it(tmp_path):
+    source = saved(tmp_path / "source", "predictive-sac", TASK)
+    config = json.loads((source.folder / "config.json").read_text())
+    del config["hyperparameters"]["critic_likelihood"]
+    (source.folder / "config.json").write_text(json.dumps(config))
+    with pytest.raises(UserError, match=r"was trained with critic_likelihood=0.0, not 0.1"):
+        train(tiny("predictive-sac"), TASK, source.folder, resume=True, **source.config["options"])
+    with pytest.raises(UserError, match=r"critic_likelihood=0.0, and this training has 0.1; set critic_likelihood=0.0"):
+        train(tiny("predictive-sac"), TASK, tmp_path / "run", init_from=source)
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.slow
 def test_a_training_starts_there_without_pretraining_and_needs_the_other_run_no_more(source, tmp_path):
     networks = arrays.load(source.agents())

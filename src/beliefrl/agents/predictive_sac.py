@@ -136,7 +136,7 @@ class PredictiveSACAgent(ControllerAgent):
     longest_memory: int = 127
     """L: these cells start with forget biases of log U(1, L), which are time constants of 2 to L + 1 steps."""
     reward_memory: tuple[float, ...] = (8.0, 64.0, 512.0)
-    """Time constants, in steps, of the memory of unusual rewards that the LSTM reads. Without any, it has no memory."""
+    """Time constants, in steps, of the memory of unusual rewards that the LSTM reads. Without any, there is none."""
     pool: int = 8
     """Number of the last cycles whose transitions are in the pool. There are `pool` × `sequences` readers."""
     average_rate: float = 2e-4

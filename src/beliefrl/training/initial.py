@@ -33,7 +33,7 @@ def taken(options: Options, agent: Agent, spec: Spec) -> tuple[dict[str, np.ndar
     source = Run(options.init_from or "")
     path = source.agents(options.init_best)
     saved = _fitting(source, arrays.load(path), agent, spec)
-    _refuse_other_layers(source, agent)
+    _refuse_other_critics(source, agent)
     first, count = source.seeds[0], len(source.seeds)
     seeds = range(options.seed, options.seed + options.seeds)
     index = [(seed - first) % count for seed in seeds]
@@ -74,15 +74,19 @@ def _last_evaluations(source: Run) -> list[dict[str, Any] | None]:
     return [None if step is None else {"step": step} for step in steps]
 
 
-def _refuse_other_layers(source: Run, agent: Agent) -> None:
-    """Layer normalisation has no arrays of its own, so `_fitting` cannot see it. Runs from before it have no entry."""
-    here = getattr(agent, "normalise_critics", False)
-    there = (values_before(agent) | source.config["hyperparameters"]).get("normalise_critics", False)
-    if there != here:
-        raise UserError(
-            f"{source.folder} cannot be init_from: it was trained with normalise_critics={there}, and this training "
-            f"has {here}; set normalise_critics={there}."
-        )
+def _refuse_other_critics(source: Run, agent: Agent) -> None:
+    """Layer normalisation has no arrays of its own, so `_fitting` cannot see it; of σ it would only name an array.
+
+    Runs from before these hyperparameters have no entries.
+    """
+    recorded = values_before(agent) | source.config["hyperparameters"]
+    for name in ("normalise_critics", "critic_likelihood"):
+        here, there = getattr(agent, name, False), recorded.get(name, False)
+        if bool(there) != bool(here):
+            raise UserError(
+                f"{source.folder} cannot be init_from: it was trained with {name}={there}, and this training "
+                f"has {here}; set {name}={there}."
+            )
 
 
 def _fitting(source: Run, saved: dict[str, np.ndarray], agent: Agent, spec: Spec) -> dict[str, np.ndarray]:
