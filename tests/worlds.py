@@ -35,10 +35,11 @@ def begun(name, spec, key):
     return tiny(name).init(key, spec)
 
 
-def saved(folder, name, task, seeds=1):
-    """A run of a small agent that has not learned anything yet, but was saved."""
-    agent = tiny(name)
-    states = jax.vmap(partial(begun, name, task.spec))(jax.random.split(jax.random.key(0), seeds))
+def saved(folder, name, task, seeds=1, agent=None):
+    """A run of a small agent (`agent`, if it is not `tiny(name)`) that was saved before it has learned anything."""
+    begin = partial(begun, name, task.spec) if agent is None else lambda key: agent.init(key, task.spec)
+    agent = tiny(name) if agent is None else agent
+    states = jax.vmap(begin)(jax.random.split(jax.random.key(0), seeds))
     config = {
         "agent": name,
         "hyperparameters": dataclasses.asdict(agent),

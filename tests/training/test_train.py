@@ -265,10 +265,12 @@ def test_other_layers_are_one_sentence_and_no_folder(tmp_path, recorded):
 
 
 def test_a_run_from_before_the_likelihood_is_not_continued_with_it(tmp_path):
-    source = saved(tmp_path / "source", "predictive-sac", TASK)
+    old = tiny("predictive-sac", critic_likelihood=0.0)
+    source = saved(tmp_path / "source", "predictive-sac", TASK, agent=old)
     config = json.loads((source.folder / "config.json").read_text())
-    del config["hyperparameters"]["critic_likelihood"]
+    assert config["hyperparameters"].pop("critic_likelihood") == 0
     (source.folder / "config.json").write_text(json.dumps(config))
+    initial.taken(Options(init_from=str(source.folder)), old, TASK.spec)
     with pytest.raises(UserError, match=r"was trained with critic_likelihood=0.0, not 0.1"):
         train(tiny("predictive-sac"), TASK, source.folder, resume=True, **source.config["options"])
     with pytest.raises(UserError, match=r"critic_likelihood=0.0, and this training has 0.1; set critic_likelihood=0.0"):

@@ -107,7 +107,7 @@ class PredictiveSACAgent(ControllerAgent):
     normalise_critics: bool = True
     """Layer normalisation, without gains, before each activation of the Q networks (Ba et al. 2016)."""
     critic_likelihood: float = 0.1
-    """w ≥ 0: weight of the negative log likelihood beside the squared error in the loss of Q. Above 0 Q also has σ."""
+    """w ≥ 0: the loss of Q is the squared error plus w times the negative log likelihood. If w > 0, Q also has a σ."""
     actor_regulariser: float = 1e-3
     """Weight of half the mean square of the policy's μ in the actor's loss."""
 
@@ -136,7 +136,7 @@ class PredictiveSACAgent(ControllerAgent):
     longest_memory: int = 127
     """L: these cells start with forget biases of log U(1, L), which are time constants of 2 to L + 1 steps."""
     reward_memory: tuple[float, ...] = (8.0, 64.0, 512.0)
-    """Time constants, in steps, of the memory of unusual rewards that the LSTM reads. Without any, there is none."""
+    """Time constants, in steps, of the memory of unusual rewards that the LSTM reads. Without any it reads none."""
     pool: int = 8
     """Number of the last cycles whose transitions are in the pool. There are `pool` × `sequences` readers."""
     average_rate: float = 2e-4

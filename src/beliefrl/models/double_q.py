@@ -25,8 +25,8 @@ temperature fit tasks with returns of any size. Departure: y does not contain th
 the sum of entropies would exceed the rewards of most tasks. And because α is in units of u, u would influence itself.
 
 With the weight w > 0 a critic also gives σ, the standard deviation of y / u, and its loss has the negative log
-likelihood of y. So an error counts more where y is certain, for example shortly before an episode ends. With the
-squared error, an error of an uncertain y still counts, for example when a reward is rare.
+likelihood of y. So an error counts more where y is certain, for example shortly before an episode ends. Because of
+the squared error, an error also counts where y is uncertain, for example where a reward is rare.
 """
 
 import math

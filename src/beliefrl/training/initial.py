@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from beliefrl import agents
 from beliefrl.agents import Agent
 from beliefrl.agents.hyperparameters import values_before
 from beliefrl.runs import arrays, best
@@ -32,7 +33,12 @@ def taken(options: Options, agent: Agent, spec: Spec) -> tuple[dict[str, np.ndar
     """
     source = Run(options.init_from or "")
     path = source.agents(options.init_best)
-    saved = _fitting(source, arrays.load(path), agent, spec)
+    try:
+        saved = _fitting(source, arrays.load(path), agent, spec)
+    except UserError:
+        if source.config["agent"] == agents.name_of(agent):
+            _refuse_other_critics(source, agent)  # a hyperparameter says more than the first array that differs
+        raise
     _refuse_other_critics(source, agent)
     first, count = source.seeds[0], len(source.seeds)
     seeds = range(options.seed, options.seed + options.seeds)
@@ -75,7 +81,7 @@ def _last_evaluations(source: Run) -> list[dict[str, Any] | None]:
 
 
 def _refuse_other_critics(source: Run, agent: Agent) -> None:
-    """Layer normalisation has no arrays of its own, so `_fitting` cannot see it; of σ it would only name an array.
+    """Layer normalisation has no arrays of its own, so `_fitting` cannot see it. σ changes the shape of arrays.
 
     Runs from before these hyperparameters have no entries.
     """
