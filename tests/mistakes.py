@@ -260,6 +260,8 @@ MISTAKES = {
     "predict untrained --best": "untrained has no best agent yet",
     "film untrained --best": "untrained has no best agent yet",
     "video untrained film.gif --best": "untrained has no best agent yet",
+    "resume untrained --envs 2": "no option --envs: a resumed training keeps its settings. `beliefrl train",
+    "resume untrained --setps 9": "no option --setps: did you mean --steps?",
     "resume untrained extra": "one argument too many, 'extra'",
     "resume damaged": "damaged has no usable checkpoint left",
     "resume foreign": "no agent 'foreign'",

@@ -158,8 +158,11 @@ def agent_name(argv: Sequence[str], command: str, more: str = "") -> tuple[str, 
     return argv[0], argv[1:]
 
 
-def parse(options: Any, argv: Sequence[str], prog: str) -> Any:
-    """Parse the options. A mistake raises a UsageError with one sentence, instead of tyro's box."""
+def parse(options: Any, argv: Sequence[str], prog: str, advice: str = "") -> Any:
+    """Parse the options. A mistake raises a UsageError with one sentence, instead of tyro's box.
+
+    `advice` is the end of the message for an option that does not exist and resembles no other.
+    """
     if any(arg in ("-h", "--help") for arg in argv):
         return tyro.cli(options, prog=prog, args=argv, registry=VALUES)
     box = io.StringIO()
@@ -169,7 +172,7 @@ def parse(options: Any, argv: Sequence[str], prog: str) -> Any:
     except SystemExit:
         raise UsageError(f"{_sentence(box.getvalue())}; `{prog} --help` shows the options.") from None
     if unknown:
-        raise UsageError(_unknown(options, unknown[0], prog))
+        raise UsageError(_unknown(options, unknown[0], prog, advice))
     return parsed
 
 
@@ -225,13 +228,13 @@ def _sentence(box: str) -> str:
     return message
 
 
-def _unknown(options: Any, given: str, prog: str) -> str:
+def _unknown(options: Any, given: str, prog: str, advice: str) -> str:
     """The error message for an argument that does not belong to any option."""
     if not given.startswith("-"):
         return f"There is one argument too many, {given!r}: `{prog} --help` shows the usage."
     names = [f"--{name.replace('_', '-')}" for name in _option_names(options)]
-    near = difflib.get_close_matches(given.split("=")[0], names, n=1)
-    hint = f"did you mean {near[0]}?" if near else f"`{prog} --help` lists the options."
+    near = difflib.get_close_matches(given.split("=")[0], names, n=1, cutoff=0.7)
+    hint = f"did you mean {near[0]}?" if near else advice or f"`{prog} --help` lists the options."
     return f"There is no option {given}: {hint}"
 
 

@@ -126,7 +126,10 @@ def train(argv: Sequence[str]) -> None:
 
 def resume(argv: Sequence[str]) -> None:
     """`beliefrl resume RUN ...`."""
-    options = parse(ResumeOptions, argv, "beliefrl resume")
+    kept = (
+        "a resumed training keeps its settings. `beliefrl train ... --init-from RUN` starts from its agent with others."
+    )
+    options = parse(ResumeOptions, argv, "beliefrl resume", kept)
     from beliefrl.training.train import resume as go_on
 
     go_on(
