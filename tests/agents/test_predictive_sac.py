@@ -91,6 +91,35 @@ def test_acting_forms_the_belief_that_replay_forms(state):
         np.testing.assert_allclose(memory.lstm.d, at_once.d[t, 0], rtol=1e-5, atol=1e-6)
 
 
+def test_a_prediction_is_made_from_the_belief_before_in_the_units_of_the_task(state):
+    """One step ahead, where all is observed; standardised again, it is the output of the predictor."""
+    window = noted(windows(jax.random.key(1), 1, TIME))
+    state = jax.jit(AGENT.learn_model)(usual(state, 0.0, 0.0), window)[0]  # scales that differ from 0 and 1
+    steps = jax.tree.map(lambda leaf: leaf[:, 0], window.step)
+    ask = jax.jit(lambda seen: AGENT.predict(state, "lstm", steps, seen, jax.random.key(0)).mean)
+    d = unrolled(state, window).d[:-1, 0]
+    expected = jax.vmap(state.model.predict)(d, steps.prev_action[1:])
+    found = ask(jnp.ones(TIME, bool))
+    of_time = steps._replace(obs=found[:, :-1], reward=found[:, -1])
+    np.testing.assert_allclose(state.scales.prediction(of_time)[1:], expected, rtol=1e-4, atol=1e-5)
+    assert np.isnan(found[0]).all()
+
+
+def test_without_observations_a_prediction_is_made_from_earlier_predictions(state):
+    """What is predicted of unobserved timesteps is what is predicted if they are as predicted."""
+    window = noted(windows(jax.random.key(1), 1, TIME))
+    state = jax.jit(AGENT.learn_model)(usual(state, 0.0, 0.1), window)[0]
+    steps, time = jax.tree.map(lambda leaf: leaf[:, 0], window.step), jnp.arange(TIME)
+    ask = jax.jit(lambda steps, seen: AGENT.predict(state, "lstm", steps, seen, jax.random.key(0)).mean)
+    alone = ask(steps, time < 3)
+    as_predicted = steps._replace(
+        obs=jnp.where((time < 3)[:, None], steps.obs, alone[:, :-1]),
+        reward=jnp.where(time < 3, steps.reward, alone[:, -1]),
+    )
+    np.testing.assert_allclose(ask(as_predicted, time >= 0), alone, rtol=1e-4, atol=1e-5)
+    assert not np.allclose(ask(steps, time >= 0)[4:], alone[4:])
+
+
 def test_a_window_that_continues_starts_from_the_state_at_the_end_of_the_last_one(state):
     """The last timestep of a window is the first of the next one; the other readers keep their states."""
     whole, learn, reader = noted(windows(jax.random.key(1), 2, 2 * TIME - 1)), jax.jit(AGENT.learn_model), (3, 1)

@@ -102,7 +102,7 @@ def test_slacs_open_loop_is_what_is_decoded_from_the_posterior():
     assert np.isnan(mean[0, -1])
 
 
-ASKED = [("vrm", "first"), ("vrm-deterministic", "keep"), ("slac", "latent")]
+ASKED = [("vrm", "first"), ("vrm-deterministic", "keep"), ("slac", "latent"), ("predictive-sac", "lstm")]
 
 
 @pytest.mark.parametrize(("name", "model"), ASKED)
@@ -178,6 +178,7 @@ def test_a_short_episode_is_seen_to_its_half(tmp_path):
         ("sac-mlp", {}, "is a run of sac-mlp, which offers no predictions"),
         ("sac-lstm", {}, "is a run of sac-lstm, which offers no predictions"),
         ("vrm-keep", {"model": "first"}, "vrm-keep has no model 'first': it has keep"),
+        ("predictive-sac", {"model": "keep"}, "predictive-sac has no model 'keep': it has lstm"),
         ("slac", {"model": "keep"}, "slac has no model 'keep': it has latent"),
         ("slac", {"start": 13}, "start=13 is impossible: the episode has 13 timesteps, so give 12 or less"),
     ],

@@ -6,20 +6,18 @@ training, and only by predicting the next observation and reward (`models.predic
 (`models.double_q`) learns on the belief. Its gradient does not reach the LSTM.
 
 This agent is not from the paper. It keeps the paper's idea: a recurrent model that learns by prediction forms the
-belief, and a soft actor-critic acts on it. It differs from `vrm` in this: one model instead of two, without latent
-variables and without a frozen copy; standardised inputs; λ-returns; no V.
+belief, and a soft actor-critic acts on it. It has one model without latent variables where `vrm` has two with them.
 
-The model reads the replay in order (`training.replay.Readers`): each reader keeps the LSTM's state at the end of its
-last window and continues from there. So in training a belief knows the episode since its beginning, or since the
-reader's last jump. After a jump the state is empty: the first window only fills it, until an episode begins.
+The model reads the replay in order (`training.replay.Readers`): a reader's window begins with the state at the end of
+its last one. So in training a belief knows the episode since its beginning, or since the reader's last jump. After a
+jump the state is empty: the first window only fills it, until an episode begins.
 
-One unroll of the windows of a cycle serves both: the model learns from it, and its beliefs become transitions. A pool
-has the transitions of the last `pool` cycles with their targets, and the controller's batches are drawn from it. The
-windows of one cycle are too few and too correlated for a batch. There are as many readers as windows in the pool.
+The beliefs of the windows of a cycle become transitions. A pool has those of the last `pool` cycles with their targets,
+and the controller's batches are drawn from it: the windows of one cycle are too few and too correlated.
 
-In training the newest weights act. Their policy can change within few updates. So evaluations and the trained agent use
-an average of the last weights of the model and of the actor (`models.average`). The learning rate of the model falls,
-because averages of a model and an actor fit together only if the beliefs change slowly.
+In training the newest weights act. Evaluations and the trained agent use an average of the last weights of the model
+and the actor (`models.average`). The learning rate of the model falls, because averages of the two fit together only if
+the beliefs change slowly.
 """
 
 import dataclasses
@@ -35,9 +33,10 @@ from beliefrl.agents.base import ControllerAgent, Range
 from beliefrl.models import average, double_q, pool, reading
 from beliefrl.models.average import Average
 from beliefrl.models.double_q import DoubleQController, Policy, Samples
-from beliefrl.models.nets import LSTMState, descend, falling_rate, standardise, update_statistics
+from beliefrl.models.forecast import forecast, perceive
+from beliefrl.models.nets import Gaussian, LSTMState, descend, falling_rate, standardise, update_statistics
 from beliefrl.models.pool import Pool
-from beliefrl.models.predictive_model import PredictiveModel, init_model, prediction_loss, remember
+from beliefrl.models.predictive_model import PredictiveModel, init_model, prediction_loss
 from beliefrl.models.scales import Scales, initial_scales
 from beliefrl.models.soft_actor_critic import OptimiserState, valid_mean
 from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range
@@ -157,6 +156,7 @@ class PredictiveSACAgent(ControllerAgent):
         "long_memories": Range(0.0, 0.5),
         "pool": (4, 8, 16),
     }
+    predictors = ("lstm",)
     values_before = {"normalise_critics": False, "lr_model_min": 1.0, "average_rate": 1.0, "critic_likelihood": 0.0}
 
     def __post_init__(self) -> None:
@@ -230,17 +230,19 @@ class PredictiveSACAgent(ControllerAgent):
     def act(
         self, state: State, memory: Memory, step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]
     ) -> tuple[Float[Array, " action"], Memory]:
-        scales = state.scales
-        x = scales.perception(step)
-        excess = jnp.where(step.is_first, 0.0, scales.usual.excess(step.reward))
-        rewards = remember(memory.note.rewards, excess, self.reward_memory)
-        lstm = state.model.next_state(memory.lstm, scales.model_input(x, rewards), step.is_first)
-        belief = standardise(scales.belief, jnp.concatenate([lstm.d, x]))
-        policy = state.controller.actor(belief)
+        before = memory.lstm, memory.note.rewards
+        lstm, rewards = perceive(state.model, state.scales, before, step, self.reward_memory)
+        belief = jnp.concatenate([lstm.d, state.scales.perception(step)])
+        policy = state.controller.actor(standardise(state.scales.belief, belief))
         return self.choose_from(policy, key, explore), Memory(lstm, Note(rewards, policy))
 
     def note(self, memory: Memory) -> Note:
         return memory.note
+
+    def predict(
+        self, state: State, model: str, step: Timestep, observed: Bool[Array, " time"], key: Key[Array, ""]
+    ) -> Gaussian:
+        return forecast(state.model, state.scales, step, observed, self.reward_memory)
 
     # Learning the model
 

@@ -25,7 +25,8 @@ class PredictOptions:
     out: Out = None
     """The picture to write, as PNG and as PDF. None: predictions.png in the run's folder."""
     model: str | None = None
-    """The model to use: keep or first for vrm, latent for slac. None: the first of these that the agent has."""
+    """The model to use: lstm for predictive-sac, keep or first for vrm, latent for slac. None: the first of these that
+    the agent has."""
     start: int | None = None
     """Number of timesteps that the closed loop observes. None: 50, or half of a shorter episode."""
     horizon: int = 100

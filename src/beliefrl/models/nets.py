@@ -263,11 +263,14 @@ def update_statistics(
     return RunningStatistics(mean, variance, batches)
 
 
+def deviations(variance: Float[Array, " size"]) -> Float[Array, " size"]:
+    """The deviations by which entries are divided."""
+    return jnp.sqrt(variance) + DEVIATION_MIN
+
+
 def standardise(statistics: RunningStatistics | None, x: Float[Array, "*batch size"]) -> Float[Array, "*batch size"]:
     """x with mean 0 and standard deviation 1, clipped to [-10, 10]; x itself if `statistics` is None."""
     if statistics is None:
         return x
-    mean, deviation = (
-        jnp.broadcast_to(v, x.shape) for v in (statistics.mean, jnp.sqrt(statistics.variance) + DEVIATION_MIN)
-    )
+    mean, deviation = (jnp.broadcast_to(v, x.shape) for v in (statistics.mean, deviations(statistics.variance)))
     return jnp.clip((x - mean) / deviation, -STANDARDISED_MAX, STANDARDISED_MAX)

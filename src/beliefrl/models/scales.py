@@ -2,10 +2,11 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from beliefrl.models.nets import RunningStatistics, initial_statistics, standardise, update_statistics
+from beliefrl.models.nets import RunningStatistics, deviations, initial_statistics, standardise, update_statistics
 from beliefrl.models.predictive_model import Usual
 from beliefrl.types import Timestep, Window
 
@@ -45,6 +46,12 @@ class Scales(NamedTuple):
     def prediction(self, step: Timestep) -> Float[Array, "*batch prediction"]:
         """(o_t, r_{t-1}), standardised: what the model predicts from h_{t-1} and a_{t-1}."""
         return jnp.concatenate(self.standardised(step), axis=-1)
+
+    def in_units(self, prediction: Float[Array, "*batch x"]) -> Float[Array, "*batch x"]:
+        """(o_t, r_{t-1}) in the units of the task, from a prediction."""
+        both = jax.tree.map(lambda *parts: jnp.concatenate(parts), self.obs[:2], self.reward[:2])
+        mean, deviation = (jnp.broadcast_to(leaf, prediction.shape) for leaf in (both[0], deviations(both[1])))
+        return mean + deviation * prediction
 
 
 def initial_scales(obs: int, belief: int) -> Scales:

@@ -6,6 +6,9 @@ The agent plays an episode. Its model predicts each x_t = (o_t, r_{t-1}) in two 
     closed loop   For t < start as in the open loop. From `start` on, z_t is sampled from the prior and x_t from the
                   decoder, and the model continues from its own samples. This measures how well it predicts the future.
 
+The model of `predictive-sac` has no latent variables. Its open loop predicts x_t from all earlier timesteps, one step
+ahead. In its closed loop the predictions take the place of the timesteps from `start` on.
+
 A prediction is the mean of many samples. σ is that of their mixture: σ² = mean of the decoder's σ² + variance of its μ.
 """
 
@@ -90,7 +93,8 @@ def predictions(
     Args:
         run: a run, or its folder.
         seed: one of the run's seeds; None: its first.
-        model: "keep" or "first" for vrm, "latent" for slac; None: the first of these that the agent has.
+        model: "lstm" for predictive-sac, "keep" or "first" for vrm, "latent" for slac; None: the first of these that
+            the agent has.
         start: number of timesteps that the closed loop observes; None: 50, or half of a shorter episode.
         horizon: number of timesteps that it predicts after that, at most to the end of the episode.
         samples: number of samples in the mean of each prediction.
@@ -139,7 +143,8 @@ def _model(run: Run, agent: Any, model: str | None) -> str:
     """The name of the model to predict with."""
     if not isinstance(agent, Predictive):
         raise UserError(
-            f"{run.folder} is a run of {run.config['agent']}, which offers no predictions: use vrm or slac."
+            f"{run.folder} is a run of {run.config['agent']}, which offers no predictions: "
+            "use predictive-sac, vrm or slac."
         )
     if model is not None and model not in agent.predictors:
         has = ", ".join(agent.predictors)
