@@ -113,6 +113,12 @@ def spaced(**given):
     return type("Fine", (Fine,), given)
 
 
+def observing(space, right, wrong):
+    """An environment with this space, and an observation that is not in it."""
+    observe = when(lambda self: right, lambda self: wrong)
+    return type("Fine", (Fine,), {"observation_space": space, "observe": observe})
+
+
 UNSUPPORTED = {  # environment: a phrase of the message
     spaced(action_space=spaces.Discrete(3)): "not discrete",
     spaced(action_space=spaces.Dict({"a": BOX})): "not discrete or composite",
@@ -140,7 +146,15 @@ UNSUPPORTED = {  # environment: a phrase of the message
     lambda: None: "robot has the actions None",
 }
 
+PAIR = spaces.MultiDiscrete([2, 3])
 FAULTS = {  # environment: (a phrase of the message, the step that it names)
+    observing(PAIR, np.array([1, 2]), np.array([2, 0])): ("does not fit its space MultiDiscrete", 3),
+    observing(spaces.Discrete(3), 1, -1): ("does not fit its space Discrete", 3),
+    observing(spaces.Dict({"a": spaces.Discrete(3)}), {"a": 1}, {"a": -1}): ("does not fit its space Dict", 3),
+    observing(spaces.Tuple([spaces.MultiBinary(2), BOX]), ([0, 1], np.ones(2)), ([5, 7], np.ones(2))): (
+        "does not fit its space Tuple",
+        3,
+    ),
     raising(ZeroDivisionError("division by zero")): ("step raised ZeroDivisionError: division by zero", 3),
     raising(RuntimeError("100 %\n  of two lines\n")): ("step raised RuntimeError: 100 % of two lines", 3),
     raising(AssertionError()): ("step raised AssertionError", 3),
@@ -196,10 +210,9 @@ class Sleeping(Fine):
 
 
 class Stuck(Fine):
-    """Its third step takes a minute if the action is positive, and SIGTERM does not end it."""
+    """Its third step takes a minute if the action is positive."""
 
     def step(self, action):
         if self.time == 2 and self.action > 0:
-            signal.signal(signal.SIGTERM, signal.SIG_IGN)
             time.sleep(60)
         return super().step(action)

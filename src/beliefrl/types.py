@@ -5,6 +5,7 @@ Axis names in shapes, everywhere: `seed` (one training each), `batch` (windows),
 """
 
 import dataclasses
+import json
 import numbers
 import typing
 from collections.abc import Iterable, Mapping, Sequence
@@ -85,6 +86,11 @@ def tuples(values: Mapping[str, Any]) -> dict[str, Any]:
         return tuple(map(frozen, value)) if isinstance(value, list) else value
 
     return {name: frozen(value) for name, value in values.items()}
+
+
+def plain(value: Any) -> Any:
+    """The value as JSON has it: tuples are lists, NumPy's numbers are numbers, and what JSON does not have is text."""
+    return json.loads(json.dumps(value, default=lambda each: each.tolist() if hasattr(each, "tolist") else str(each)))
 
 
 def as_array(value: Any) -> np.ndarray:

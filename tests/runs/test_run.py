@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import beliefrl
+from beliefrl.runs import records
 from beliefrl.runs.arrays import write_whole
 from beliefrl.runs.folder import free_folder
 from beliefrl.runs.options import Options
@@ -354,3 +355,17 @@ def test_provenance_says_what_a_run_was_made_with():
     assert set(made["versions"]) == {"python", "beliefrl", "jax", "jaxlib", "equinox", "optax", "numpy"}
     assert made["versions"]["jax"] == jax.__version__
     json.dumps(made)
+
+
+def test_the_commit_is_not_that_of_a_project_around_the_package(tmp_path, monkeypatch):
+    inside = tmp_path / "project" / ".venv" / "records.py"
+    inside.parent.mkdir(parents=True)
+    inside.touch()
+    git = ["git", "-C", str(tmp_path / "project"), "-c", "user.name=a", "-c", "user.email=a"]
+    subprocess.run([*git, "init", "-q"], check=True)
+    subprocess.run([*git, "commit", "-q", "--allow-empty", "-m", "first"], check=True)
+    monkeypatch.setattr(records, "__file__", str(inside))
+    assert provenance()["git_commit"] is None
+    subprocess.run([*git, "add", "-f", str(inside)], check=True)
+    subprocess.run([*git, "commit", "-q", "-m", "second"], check=True)
+    assert re.fullmatch("[0-9a-f]{40}", provenance()["git_commit"])

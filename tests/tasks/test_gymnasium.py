@@ -47,9 +47,19 @@ def test_a_fault_names_the_environment_the_seed_and_the_step(make, monkeypatch):
     lanes.close()
 
 
-def test_there_are_at_least_thirty_bad_environments():
-    assert len(FAULTS) + len(UNSUPPORTED) > 30
-    assert len(FAULTS) > 30
+def test_options_of_a_reset_are_none_also_at_a_restart():
+    """Gymnasium's vector environments remove their own entry and leave an empty dict."""
+    given = []
+
+    class Asking(Fine):
+        def reset(self, *, seed=None, options=None):
+            given.append(options)
+            return super().reset(seed=seed)
+
+    lanes = Lockstep(GymnasiumTask(Asking), ["seed 0"])
+    lanes.reset(np.array([0]))
+    lanes.restart(np.array([True]))
+    assert given[-2:] == [None, None]
 
 
 def test_actions_are_scaled_to_the_range_of_the_environment():

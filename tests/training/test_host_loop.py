@@ -1,7 +1,10 @@
 """Training on the host's environments: equal to the compiled loop, in processes or not; and faults lose nothing."""
 
 import dataclasses
+import os
+import pathlib
 import re
+import signal
 import sys
 
 import gymnasium
@@ -161,6 +164,53 @@ def test_a_fault_in_a_process_of_its_own_is_reported_too(make, phrase):
     assert re.match(phrase, str(error.value))
 
 
+class Closing(Fine):
+    """Writes a file when it is closed after a step. Its third step fails if the action is positive."""
+
+    def __init__(self, folder):
+        self.folder = pathlib.Path(folder)
+
+    def step(self, action):
+        if self.time == 2 and action > 2:
+            raise ValueError("out of range")
+        return super().step(action)
+
+    def close(self):
+        if getattr(self, "time", 0):
+            (self.folder / f"closed-{os.getpid()}-{id(self)}").touch()
+
+
+@pytest.mark.parametrize("processes", ["never", "always"])
+def test_after_a_fault_every_environment_is_closed(tmp_path, processes):
+    lanes = Lockstep(GymnasiumTask(Closing, "robot", {"folder": str(tmp_path)}), ["seed 0", "seed 1"], processes)
+    lanes.reset(np.array([0, 1]))
+    with pytest.raises(Fault, match="out of range"):  # noqa: PT012
+        for _ in range(3):
+            lanes.step(np.array([[1.0], [-1.0]], np.float32))
+    lanes.close()
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_signal_for_all_processes_does_not_end_the_environments():
+    """A scheduler may send SIGTERM to each process of a job. The training then saves, and still needs them."""
+    lanes = Lockstep(GymnasiumTask(Fine), ["a", "b"], "always")
+    lanes.reset(np.array([0, 1]))
+    workers = lanes._envs.processes
+    for worker in workers:
+        os.kill(worker.pid, signal.SIGTERM)
+    lanes.step(np.zeros((2, 1), np.float32))
+    lanes.close()
+    assert not any(worker.is_alive() for worker in workers)
+
+
+def test_processes_that_share_one_core_do_not_pay(monkeypatch):
+    monkeypatch.setattr(lockstep, "step_seconds", lambda task: 1.0)
+    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    for free, pays in (({3}, False), ({3, 5}, True)):
+        monkeypatch.setattr(os, "sched_getaffinity", lambda process, free=free: free, raising=False)
+        assert lockstep._pays(GymnasiumTask(Fine), 2) == pays
+
+
 class Late(Fine):
     """Fails at its 27th step in all."""
 
@@ -192,6 +242,29 @@ def test_a_training_goes_on_from_a_fault(tmp_path, episodes):
         assert [row["step"] for row in run.rows(seed, "evaluation")] == [20, 40]
         steps = [row["step"] for row in run.rows(seed, "update")]
         assert (steps[0], steps[-1]) == ((26, 40) if episodes == 2 else (40, 40))
+
+
+class Single(Fine):
+    """At most two at a time, one for each seed: there is none left for evaluations."""
+
+    count = 0
+
+    def __init__(self):
+        if Single.count == 2:
+            raise OSError("the port is in use")
+        Single.count += 1
+
+    def close(self):
+        Single.count -= 1
+
+
+@pytest.mark.slow
+def test_an_environment_that_cannot_be_made_for_an_evaluation_is_a_fault(tmp_path):
+    agent, notes = agents.make("sac-mlp", **SHARED, **SMALL["sac-mlp"]), []
+    with pytest.raises(UserError, match="the port is in use"):
+        train(agent, GymnasiumTask(Single, "robot"), tmp_path / "run", **few(checkpoint_steps=0, eval_every=30))
+    resume(tmp_path / "run", task=GymnasiumTask(Fine, "robot"), callback=lambda event: notes.append(event.note))
+    assert "goes on from the checkpoint of step 30" in notes
 
 
 @pytest.mark.slow

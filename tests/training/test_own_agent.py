@@ -53,6 +53,14 @@ def test_it_gets_the_hyperparameters_of_the_run(run, agent):
     assert agent_of(run, agent) == Foreteller(cycle=2)
 
 
+def test_a_run_that_was_given_numpys_numbers_is_read_and_resumed(tmp_path):
+    agent = CountingAgent(cycle=np.int64(2))
+    run = beliefrl.train(agent, "pendulum-p", tmp_path / "run", seed=np.arange(2)[1], **OPTIONS)
+    assert (run.config["hyperparameters"]["cycle"], run.config["options"]["seed"]) == (2, 1)
+    assert beliefrl.evaluate(run, 1, agent=CountingAgent)["episodes"] == 1
+    assert beliefrl.resume(run, 30, agent=CountingAgent).results()["step"] == 30
+
+
 def test_whatever_reads_a_run_takes_it(run, tmp_path):
     assert beliefrl.evaluate(run, 2, agent=Foreteller)["episodes"] == 2
     policy = beliefrl.load(run, agent=Foreteller())

@@ -8,7 +8,7 @@ import pytest
 from beliefrl import agents, tasks
 from beliefrl.runs.options import Options
 from beliefrl.training import phases, schedule
-from beliefrl.training.evaluation import evaluate, summary
+from beliefrl.training.evaluation import MODES, evaluate, summary
 from beliefrl.training.log import without
 from beliefrl.training.rollout import Episode
 from beliefrl.training.schedule import Event, Phase
@@ -154,12 +154,22 @@ def test_steps_are_counted_as_environment_steps():
     assert int(seeds.actor.length[0]) == 50 % 7
 
 
-def test_evaluation_leaves_training_alone_and_separates_modes():
-    program = phases.compile_program(CountingAgent(), Counting(ends=4), capacity=90, episodes=3)
+class Alternating(Counting):
+    """Pays the action, by turns added and subtracted."""
+
+    def step(self, state, action, key):
+        state, obs, _, terminated = super().step(state, action, key)
+        return state, obs, jnp.where(state % 2 == 0, action[0], -action[0]), terminated
+
+
+def test_evaluation_has_the_returns_of_sampled_actions_and_of_mode_actions():
+    """The agent's mode is the same action at every step, so it has a return of 0."""
+    program = phases.compile_program(CountingAgent(), Alternating(ends=4), capacity=90, episodes=3)
     keys = jax.random.split(jax.random.key(0), 2)
-    result = program.evaluate(program.begin(keys).state, keys)
-    assert result.episode_return.shape == (2, 2, 3)
-    np.testing.assert_array_equal(result.episode_return, 10)
+    returns = np.asarray(program.evaluate(program.begin(keys).state, keys).episode_return)
+    assert returns.shape == (2, 2, 3)
+    np.testing.assert_array_equal(returns[:, MODES.index("mode")], 0)
+    assert len(np.unique(returns[:, MODES.index("sampled")])) == 6
 
 
 @pytest.mark.parametrize(

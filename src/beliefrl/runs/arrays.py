@@ -16,7 +16,7 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from beliefrl.types import UserError
+from beliefrl.types import UserError, cause
 
 
 class Damaged(UserError):
@@ -65,8 +65,10 @@ def about(path: pathlib.Path) -> dict[str, str]:
     try:
         with safetensors.safe_open(path, "numpy") as file:
             return file.metadata() or {}
-    except (OSError, safetensors.SafetensorError):
+    except (FileNotFoundError, safetensors.SafetensorError):
         raise damaged(path) from None
+    except OSError as error:
+        raise unreadable(path, error) from None
 
 
 def misfit(path: pathlib.Path, name: str) -> UserError:
@@ -85,13 +87,20 @@ def load(path: pathlib.Path) -> dict[str, np.ndarray]:
     """
     try:
         return safetensors.numpy.load_file(path)
-    except (OSError, safetensors.SafetensorError):
+    except (FileNotFoundError, safetensors.SafetensorError):
         raise damaged(path) from None
+    except OSError as error:
+        raise unreadable(path, error) from None
 
 
 def damaged(path: pathlib.Path) -> Damaged:
-    """The error that a file cannot be read."""
+    """The error that a file has another content than was written, or is missing."""
     return Damaged(f"{path} is damaged: restore it from a copy, or train again.")
+
+
+def unreadable(path: pathlib.Path, error: OSError) -> UserError:
+    """The error that the system cannot read a file now. Its content may be right."""
+    return UserError(f"{path} cannot be read ({cause(error)}): make it readable, then try again.")
 
 
 def _named(tree: Any) -> list[tuple[str, Any]]:

@@ -155,7 +155,7 @@ class Checkpoints:
         kept += self.folder.glob("kept-*")
         try:
             named = {segment["file"] for path in kept for segment in _content(path)["replay"]}
-        except Damaged:  # nobody knows which files it needs
+        except UserError:  # nobody knows which files it needs
             return
         for path in (self.folder / "replay").iterdir():
             if path.name not in named:
@@ -256,15 +256,19 @@ def _content(path: pathlib.Path) -> dict[str, Any]:
         signed = json.loads((path / "manifest.json").read_bytes())
         if _sha256(_canonical(signed["content"])) == signed["sha256"]:
             return signed["content"]
-    except (OSError, ValueError, KeyError, TypeError):
+    except (FileNotFoundError, ValueError, KeyError, TypeError):
         pass
+    except OSError as error:
+        raise arrays.unreadable(path / "manifest.json", error) from None
     raise Damaged(f"{path / 'manifest.json'} is damaged.")
 
 
 def _check(path: pathlib.Path, size: int, sha256: str) -> None:
     try:
         content = path.read_bytes()
-    except OSError:
+    except FileNotFoundError:
         content = b""
+    except OSError as error:
+        raise arrays.unreadable(path, error) from None
     if len(content) != size or _sha256(content) != sha256:
         raise Damaged(f"{path} is damaged.")

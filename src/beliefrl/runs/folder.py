@@ -10,7 +10,7 @@ from typing import Any
 
 from beliefrl.runs import records
 from beliefrl.runs.arrays import write_whole
-from beliefrl.types import UserError, cause
+from beliefrl.types import UserError, cause, plain
 
 MAKING = r"metrics|lock|\.config\.json\.tmp"  # files that are made before config.json
 UNSAVED = (  # files of a training that has saved no agent and no checkpoint
@@ -59,7 +59,7 @@ def clear(folder: pathlib.Path) -> None:
 
 def write_config(folder: pathlib.Path, config: dict[str, Any]) -> None:
     """Write config.json atomically."""
-    write_whole(folder / "config.json", (json.dumps(config, indent=2, default=str) + "\n").encode())
+    write_whole(folder / "config.json", (json.dumps(plain(config), indent=2) + "\n").encode())
 
 
 def locked(folder: pathlib.Path, doing: str) -> Any:

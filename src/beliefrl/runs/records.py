@@ -12,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from datetime import UTC, datetime
+from functools import partial
 from importlib import metadata
 from typing import Any
 
@@ -198,15 +199,16 @@ def now() -> str:
 
 
 def _git_commit() -> str | None:
-    """The commit of the running code, with a + if there are uncommitted changes; None outside a git checkout."""
+    """The commit of the running code, with a + if there are uncommitted changes; None outside its git checkout.
+
+    If the package is installed inside of another project's checkout, git finds that one, which does not track it.
+    """
+    file = pathlib.Path(__file__)
+    ask = partial(subprocess.run, cwd=file.parent, capture_output=True, text=True, timeout=10)
     try:
-        found = subprocess.run(
-            ["git", "describe", "--always", "--abbrev=40", "--dirty=+", "--match="],
-            cwd=pathlib.Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            timeout=10,
-        )
+        if ask(["git", "ls-files", "--error-unmatch", file.name]).returncode:
+            return None
+        found = ask(["git", "describe", "--always", "--abbrev=40", "--dirty=+", "--match="])
     except (OSError, subprocess.TimeoutExpired):
         return None
     return found.stdout.strip() or None

@@ -1,5 +1,6 @@
 """The files with a replay's timesteps. Each has those that were added between two checkpoints."""
 
+import itertools
 import math
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -71,6 +72,8 @@ def read(folder: Path, like: Any, segments: list[Segment], axes: int) -> tuple[A
     """
     shape = jax.tree.leaves(like)[0].shape[: axes + 1]
     begin = np.array(segments[0].start if segments else np.zeros(math.prod(shape[:-1]), int))
+    for before, segment in itertools.pairwise(segments):  # a gap, if another ring needs a segment from before it
+        begin = np.where(np.array(segment.start) > np.array(before.stop), segment.start, begin)
     stop = np.array(segments[-1].stop) if segments else begin
     missing = np.where((begin > np.maximum(stop - shape[-1], 0)).any(), begin, 0)
     rings = jax.tree.map(lambda leaf: np.zeros((math.prod(leaf.shape[:axes]), *leaf.shape[axes:]), leaf.dtype), like)
@@ -88,8 +91,9 @@ def read(folder: Path, like: Any, segments: list[Segment], axes: int) -> tuple[A
 def _fill(rings: np.ndarray, saved: np.ndarray, segment: Segment, missing: np.ndarray) -> None:
     """Write a segment's timesteps into the rings, (ring, capacity, ...)."""
     for number, (start, stop) in enumerate(zip(segment.start, segment.stop, strict=True)):
-        index = (np.arange(start, stop) - missing[number]) % rings.shape[1]
-        rings[number, index] = saved[number, : stop - start]
+        first = min(max(start, int(missing[number])), stop)
+        index = (np.arange(first, stop) - missing[number]) % rings.shape[1]
+        rings[number, index] = saved[number, first - start : stop - start]
 
 
 def _on_host(leaf: Any) -> Any:

@@ -22,7 +22,7 @@ from beliefrl.runs.options import Options
 from beliefrl.runs.run import Run
 from beliefrl.tasks.faults import Faults
 from beliefrl.training.schedule import capacity
-from beliefrl.types import UserError
+from beliefrl.types import UserError, plain
 
 OPTIONS = tuple(field.name for field in dataclasses.fields(Options))
 FAULTS = tuple(field.name for field in dataclasses.fields(Faults))
@@ -189,7 +189,7 @@ def extended(
 
 def _line(training: Training) -> tuple[Any, ...]:
     """A key that is equal for trainings that differ only in seeds and options."""
-    settings = json.dumps([training.settings, training.constants, training.faults], sort_keys=True, default=str)
+    settings = json.dumps(plain([training.settings, training.constants, training.faults]), sort_keys=True)
     return training.agent, training.task, settings, training.observe
 
 
@@ -256,7 +256,7 @@ def _check(trainings: Iterable[Training]) -> None:
         agent = agent_of(training.agent, training.settings)
         capacity(agent, Options(**_typed(training.options, Options)))
         task = [training.task, training.observe or None, training.faults, training.constants]
-        key = json.dumps(task, sort_keys=True, default=str)
+        key = json.dumps(plain(task), sort_keys=True)
         if key not in specs:
             specs[key] = tasks.make(*task[:3], **training.constants).spec
 

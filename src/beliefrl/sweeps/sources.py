@@ -15,7 +15,7 @@ import numpy as np
 
 from beliefrl.runs.arrays import write_whole
 from beliefrl.sweeps.plan import Experiment, Training, grid
-from beliefrl.types import UserError, said
+from beliefrl.types import UserError, plain, said
 
 PLAN = "sweep.json"  # in the folder of a sweep
 
@@ -153,4 +153,4 @@ def read(sweep: pathlib.Path) -> list[Training]:
 def write(sweep: pathlib.Path, trainings: Sequence[Training]) -> None:
     """Write the trainings of a sweep to its sweep.json."""
     content = {"format": 1, "trainings": [dataclasses.asdict(training) for training in trainings]}
-    write_whole(sweep / PLAN, (json.dumps(content, indent=1, default=str) + "\n").encode())
+    write_whole(sweep / PLAN, (json.dumps(plain(content), indent=1) + "\n").encode())

@@ -5,7 +5,6 @@ Optuna's journal is a file of JSON lines. Only the process that has locked the f
 
 import contextlib
 import dataclasses
-import json
 import math
 import pathlib
 import statistics
@@ -19,7 +18,7 @@ from beliefrl.runs.options import Options
 from beliefrl.runs.run import Run
 from beliefrl.sweeps import ranges
 from beliefrl.sweeps.plan import Experiment, Training, agent_of, plan
-from beliefrl.types import UserError, short
+from beliefrl.types import UserError, plain, short
 
 JOURNAL = "study.journal"
 RECORD = "search"  # the attribute of a study with `Search.record`
@@ -89,7 +88,7 @@ class Search:
         common |= {"objective": self.objective, "actions": self.actions}
         common |= {**base.options, **base.settings, **base.faults, **base.constants}
         common |= {f"range of {name}": values for name, values in ranges.as_json(self.ranges).items()}
-        return json.loads(json.dumps(common, default=str))
+        return plain(common)
 
     def returns(self, run: Run) -> dict[int, float]:
         """The return at each evaluation that every seed has, mean over seeds and episodes: {step: return}."""

@@ -16,7 +16,7 @@ from gymnasium import spaces
 
 from beliefrl.catalogue import our_task_names
 from beliefrl.tasks.faults import NONE, STREAM, Draws, Faults
-from beliefrl.tasks.spaces import check_actions, flat_bounds, flat_size, limits, observation_names
+from beliefrl.tasks.spaces import check_actions, fits, flat_bounds, flat_size, limits, observation_names
 from beliefrl.types import LARGEST, Spec, UserError, as_array, check_indices, check_range, said, short
 
 ENDLESS = 10_000  # steps after which an episode without a time limit is considered endless
@@ -139,7 +139,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode."""
         self.length, self._measured = 0, {}
-        result = self._call("reset", lambda: self.inner.reset(seed=seed, options=options))
+        result = self._call("reset", lambda: self.inner.reset(seed=seed, options=options or None))
         if not (isinstance(result, tuple) and len(result) == 2):
             raise self._fault("reset did not return (observation, info)")
         return self._seen(result[0]), {}
@@ -215,7 +215,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
                 raise self._fault(f"the observation has shape {value.shape}, but its space says {space.shape}")
         else:
             try:
-                value = np.asarray(spaces.flatten(space, obs))
+                value = np.asarray(spaces.flatten(space, obs)) if fits(space, obs) else np.empty(0)
             except Exception:
                 raise self._fault(f"the observation does not fit its space {short(space)}") from None
             if value.shape != (self._size,):

@@ -103,6 +103,15 @@ def flat_bounds(space: Any) -> spaces.Box:
     return flat
 
 
+def fits(space: Any, obs: Any) -> bool:
+    """Whether the discrete parts of an observation are in its space. `flatten` would turn others into numbers, too."""
+    if isinstance(space, spaces.Dict):
+        return all(fits(part, obs[name]) for name, part in space.items())
+    if isinstance(space, spaces.Tuple):
+        return all(fits(part, value) for part, value in zip(space, obs, strict=True))
+    return isinstance(space, spaces.Box) or space.contains(obs)
+
+
 def limits(space: Any, indices: Int[np.ndarray, " obs"]) -> tuple[Float[np.ndarray, " obs"], Float[np.ndarray, " obs"]]:
     """The smallest and largest accepted values of these entries of the observation: its space, with a wide margin."""
     bounds = flat_bounds(space)

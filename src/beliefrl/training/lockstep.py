@@ -4,6 +4,7 @@ The environments do not reset themselves. `restart` begins the next episode afte
 was returned.
 """
 
+import atexit
 import contextlib
 import multiprocessing
 import os
@@ -20,10 +21,10 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from beliefrl.tasks.gymnasium import Environment, Fault, GymnasiumTask
+from beliefrl.training.stop import SIGNALS
 from beliefrl.types import UserError
 
 HANDOVER = 5e-4  # approximate seconds for passing a step to other processes
-PATIENCE = 5.0  # seconds in which a process can end by itself
 SLOW = 60.0  # seconds after which a call that has not returned is reported
 
 
@@ -83,6 +84,7 @@ class Lockstep:
                 if self.apart:
                     # Forking a process in which JAX runs threads may never return.
                     self._envs = AsyncVectorEnv(factories, context="spawn", autoreset_mode=AutoresetMode.DISABLED)
+                    atexit.register(self.close)  # at its exit Python would wait for processes that ignore SIGTERM
                 else:
                     self._envs = SyncVectorEnv(factories, autoreset_mode=AutoresetMode.DISABLED)
         except BaseException:
@@ -115,11 +117,10 @@ class Lockstep:
     def close(self) -> None:
         """Close all environments; errors while closing are ignored."""
         self._closed.set()
+        atexit.unregister(self.close)
         if self.apart and self._call is not None:  # a regular close would wait for the step to end
             for process in self._envs.processes:
-                process.terminate()
-                process.join(PATIENCE)
-                process.kill()  # if it ignores that
+                process.kill()  # they ignore milder signals
                 process.join()
             self._envs.closed = True
         with contextlib.suppress(Exception):
@@ -132,11 +133,14 @@ class Lockstep:
         try:
             with _silence():
                 yield
-            self._call = None
-        except (EOFError, ConnectionError, BrokenPipeError):
+        except (EOFError, ConnectionError):
             raise Fault(self._death()) from None
         except multiprocessing.TimeoutError:
             raise Fault(self._delay()) from None
+        except Exception:  # the call has returned, with an error of an environment
+            self._call = None
+            raise
+        self._call = None
 
     def _watch(self, notify: Callable[[str], None]) -> None:
         """Report every call that takes longer than SLOW, once."""
@@ -177,7 +181,8 @@ class _Factory:
 
     def __call__(self) -> Environment:
         if multiprocessing.parent_process() is not None:
-            signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the training, which ends the workers
+            for number in SIGNALS:  # of a whole group of processes; the training saves, and then ends the workers
+                signal.signal(number, signal.SIG_IGN)
         return self.task.environment(self.lane)
 
 
@@ -193,7 +198,8 @@ def _silence() -> Iterator[None]:
 
 def _pays(task: GymnasiumTask, lanes: int) -> bool:
     """Whether processes of their own are faster, measured with some random steps."""
-    cores = min(lanes, os.cpu_count() or 1)
+    free = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = min(lanes, free)
     return cores > 1 and lanes * step_seconds(task) * (1 - 1 / cores) > HANDOVER
 
 

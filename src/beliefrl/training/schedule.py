@@ -149,7 +149,7 @@ def _stages(
     explored = min(agent.step_start_rl, options.steps)
     stretch = stretch_length(agent, envs)
 
-    if at.evaluated // options.eval_every < at.step // options.eval_every:  # an environment failed in this evaluation
+    if at.evaluated // options.eval_every < at.step // options.eval_every:  # an environment failed before its end
         yield from _evaluation(agent, program, seeds, at.step, Phase.LEARNING)
         at = at._replace(evaluated=at.step)
         yield Event(Phase.LEARNING, at.step, snapshot=Snapshot(at, seeds))
@@ -197,9 +197,11 @@ def _stages(
             yield from _evaluation(agent, program, seeds, at.step, Phase.LEARNING)
             at = at._replace(evaluated=at.step)
         yield Event(Phase.LEARNING, at.step, snapshot=Snapshot(at, seeds))
+    last = None
     if at.evaluated < at.step:
         yield from _evaluation(agent, program, seeds, at.step, Phase.LEARNING)
-        yield Event(Phase.FINISHED, at.step, snapshot=Snapshot(at._replace(evaluated=at.step), seeds))
+        last = Snapshot(at._replace(evaluated=at.step), seeds)
+    yield Event(Phase.FINISHED, at.step, snapshot=last)
 
 
 ROOM = 1.25  # timesteps in the replay per step: with episodes of at least 4 steps it has the whole training
@@ -242,7 +244,8 @@ def _evaluation(agent: Agent, program: Program, seeds: SeedState, step: int, the
     of_step = jax.vmap(lambda key: keys.step_key(key, jnp.asarray(step), keys.EVALUATE))
     try:
         result = program.evaluate(agent.networks(seeds.state), of_step(seeds.key))
-    except Fault as fault:
+    except UserError as error:  # also of an environment that cannot be made
+        fault = error if isinstance(error, Fault) else Fault(str(error))
         fault.seeds, fault.step = seeds, step
-        raise
+        raise fault from None
     yield Event(then, step, evaluation=result, states=seeds.state)

@@ -218,15 +218,20 @@ class Session:
         progress, asked = snapshot.progress, self.requests.number
         if progress.refreshed and not self.last.refreshed:
             self.checkpoints.forget_timesteps()
-        self._save(snapshot)
+        if event.phase is not Phase.FAULT:
+            self._save(snapshot)
         if self._has_ended(progress):
             return False
         go_on = f"`beliefrl resume {as_argument(self.recorder)}` goes on from there"
         go_on = f"{go_on}, in Python beliefrl.resume({str(self.recorder.folder)!r})"
         if event.phase is Phase.FAULT:
-            with contextlib.suppress(UserError):  # the Fault itself is raised next
+            try:  # the Fault itself is raised next
+                self._save(snapshot)
                 self.checkpoints.wait()
                 self._note(f"saved at step {progress.step:,}; {go_on}")
+            except (OSError, UserError) as error:
+                why = cause(error) if isinstance(error, OSError) else error
+                self._note(f"the checkpoint of step {progress.step:,} cannot be written ({why})")
         elif asked:
             self.checkpoints.wait()
             raise Stopped(f"stopped at step {progress.step:,}; {go_on}.", asked)

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import json
 import os
 from collections.abc import Iterator
 from typing import Any, Literal
@@ -21,7 +20,7 @@ from beliefrl.training import initial
 from beliefrl.training.evaluation import agent_of, task_of
 from beliefrl.training.schedule import Event, Options, capacity
 from beliefrl.training.session import Callback, Session
-from beliefrl.types import UserError, tuples
+from beliefrl.types import UserError, plain, tuples
 
 CHANGEABLE = ("steps", "stop_at", "stop_patience", "step_timeout")  # options that may differ when a training continues
 
@@ -245,7 +244,7 @@ def _check_same(run: Run, config: dict[str, Any], older: dict[str, Any]) -> None
     asked = {name: config.get(name) for name in ("agent", "task", "constants", "observe", "faults")}
     asked |= config["options"] | _with_functions_of(run.config["hyperparameters"], config["hyperparameters"])
     before = {"faults": None} | dataclasses.asdict(Options())  # what an older version did not record, it did not have
-    asked, before = json.loads(json.dumps([asked, before | older], default=str))  # tuples are lists in the run's config
+    asked, before = plain([asked, before | older])  # tuples are lists in the run's config
     there = before | run.config | run.config["options"] | run.config["hyperparameters"]
     there |= {name: asked[name] for name in CHANGEABLE}
     for name, value in asked.items():
@@ -262,7 +261,7 @@ def _check_same_task(run: Run, task: Any) -> None:
     asked, there = ({"faults": None} | each for each in (tasks.describe(task), run.config))
     same = ("task", "faults") if isinstance(task, GymnasiumTask) else ("task", "faults", "constants")
     for name in same:
-        ours, theirs = (json.loads(json.dumps(each[name], default=str)) for each in (asked, there))
+        ours, theirs = (plain(each[name]) for each in (asked, there))
         if name == "task":
             ours, theirs = (each.rpartition(":")[2] for each in (ours, theirs))
         if ours != theirs:
