@@ -123,7 +123,8 @@ def a_folder(
             rates = {"sampled_success": success[0], "mode_success": [True]} if success else {}
             lines.append({"step": step, "kind": "evaluation", "sampled": returns, "mode": [7.0], **rates})
         if seed in diverged:
-            lines.append({"step": lines[-1]["step"] + 5, "kind": "diverged", "why": "a loss is not finite"})
+            last = lines[-1]["step"] if lines else 0
+            lines.append({"step": last + 5, "kind": "diverged", "why": "a loss is not finite"})
         text = "".join(json.dumps(line) + "\n" for line in lines)
         (folder / "metrics" / f"seed-{seed}.jsonl").write_text(text)
     return folder

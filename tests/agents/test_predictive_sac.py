@@ -204,11 +204,7 @@ def test_pretraining_learns_which_rewards_are_usual_and_what_follows_does_not_ch
 def test_the_targets_have_the_discount_of_the_agent(begun):
     trained, _, window = begun
     other = dataclasses.replace(AGENT, gamma=0.5)
-    plain, same_gamma, half = (
-        jax.jit(agent.begin_cycle)(trained, window, jax.random.key(3))[0].pool
-        for agent in (AGENT, dataclasses.replace(AGENT, gamma=0.99), other)
-    )
-    assert same(plain, same_gamma)
+    plain, half = (jax.jit(agent.begin_cycle)(trained, window, jax.random.key(3))[0].pool for agent in (AGENT, other))
     assert not same(plain, half)
 
 

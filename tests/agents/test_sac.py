@@ -209,10 +209,18 @@ def test_timesteps_that_do_not_exist_enter_no_loss(state):
 
 
 def test_it_perceives_what_its_options_name():
-    for more, size in (({}, 3), ({"perceive_action": True}, 5), ({"perceive_reward": True}, 4)):
-        agent = dataclasses.replace(RECURRENT, **more)
+    step = windows(jax.random.key(1), 2, TIME).step
+    obs, action, reward = step.obs, step.prev_action, step.reward[..., None]
+    for more, parts in (
+        ({}, [obs]),
+        ({"perceive_action": True}, [obs, action]),
+        ({"perceive_reward": True}, [obs, reward]),
+        ({"perceive_action": True, "perceive_reward": True}, [obs, action, reward]),
+    ):
+        agent, expected = dataclasses.replace(RECURRENT, **more), jnp.concatenate(parts, axis=-1)
         state = jax.eval_shape(lambda key, agent=agent: agent.init(key, SPEC), jax.random.key(0))
-        assert state.lstm.w_x.shape[0] == size
+        assert state.lstm.w_x.shape[0] == expected.shape[-1]
+        np.testing.assert_array_equal(agent.perception(step), expected)
 
 
 @pytest.mark.parametrize("wrong", [{"seq_len": 0}, {"burn_in": -1}, {"lr_lstm": 2.0}, {"pretrain_updates": -1}])

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from beliefrl.analysis import panels
-from beliefrl.analysis.figures import draw_curve, standard_error
+from beliefrl.analysis import aggregate, panels
+from beliefrl.analysis.figures import curve_figure, draw_curve, standard_error
 from beliefrl.analysis.groups import groups
 from beliefrl.analysis.panels import dashes
 from beliefrl.analysis.tables import (
@@ -134,6 +134,21 @@ def test_success_is_shown_where_a_task_has_it_and_an_unknown_time_is_unknown(tmp
     assert row[4] == "2.0; success 50%"
     assert row[5] == "7.0; success 100%"
     assert row[7] == "unknown"
+
+
+def test_a_seed_that_diverged_does_not_count_in_a_row_and_is_named(tmp_path):
+    """It has an evaluation from before."""
+    two = [flat(100, 960), flat(100, 500)]
+    (row,) = final_rows(groups([a_run(tmp_path / "one", two, task="cartpole", diverged=[1])]))
+    assert row[4:6] == ("960.0 (1 of 2 diverged)", "7.0 (1 of 2 diverged)")
+    (row,) = final_rows(groups([a_run(tmp_path / "all", two, task="cartpole", diverged=[0, 1])]))
+    assert row[4:6] == ("diverged", "diverged")
+
+
+def test_a_measure_that_only_some_runs_have_is_not_in_a_row(tmp_path):
+    runs = [a_run(tmp_path / "a", with_success([flat(1.0)])), a_run(tmp_path / "b", [flat(3.0)], first=1)]
+    (row,) = final_rows(groups(runs))
+    assert row[4] == "2.0 ± 1.0"
 
 
 def test_runs_without_an_evaluation_are_not_in_it(tmp_path):
@@ -310,6 +325,49 @@ def test_the_models_loss_is_the_mean_since_the_evaluation_before(tmp_path, drawn
     np.testing.assert_array_equal(right.lines[0].get_ydata(), [7.0, 1.0])
 
 
+def test_the_dashes_of_a_models_loss_are_those_of_its_legend(tmp_path, drawn):
+    updates = [(5, {"negative_elbo": 8.0}), (15, {"negative_elbo": 6.0})]
+    panels.draw_elbo(groups([a_run(tmp_path / "a", [flat(1.0, 2.0)], updates=updates)]), tmp_path / "picture")
+    (entry,) = [line for line in drawn[0].legends[0].get_lines() if "dashed" in line.get_label()]
+    assert drawn[0].axes[1].lines[0].get_linestyle() == entry.get_linestyle() == "--"
+
+
+def test_a_seed_without_updates_does_not_hide_the_loss_of_the_others(tmp_path):
+    updates = [(5, {"negative_elbo": 8.0}), (15, {"negative_elbo": 6.0})]
+    runs = [
+        a_run(tmp_path / "a", [flat(1.0, 2.0)], updates=updates),
+        a_run(tmp_path / "b", [[]], first=1, diverged=[1]),
+    ]
+    (group,) = groups(runs)
+    np.testing.assert_array_equal(panels.model_loss(group).seeds, [[8.0, 6.0], [np.nan, np.nan]])
+
+
+def test_a_bar_has_the_label_of_its_agent_and_a_profile_falls(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(aggregate, "save", lambda figure, out: made.append(figure) or out)
+    runs = [
+        a_run(tmp_path / agent, [flat(value)], agent=agent, task="cartpole")
+        for agent, value in (("vrm", 900.0), ("slac", 200.0))
+    ]
+    aggregate.draw_aggregate(groups(runs), tmp_path / "picture")
+    left, right = made[0].axes
+    names = {tick: text.get_text() for tick, text in zip(left.get_yticks(), left.get_yticklabels(), strict=True)}
+    middles = {names[round(float(np.mean(line.get_ydata())))]: line.get_xdata()[0] for line in left.lines}
+    assert middles["vrm"] > 0.8 > 0.3 > middles["slac"]
+    assert all(line.get_ydata()[0] == 1.0 and line.get_ydata()[-1] == 0.0 for line in right.lines)
+
+
+def test_a_curve_draws_each_measure_with_its_actions_and_names_the_task(tmp_path):
+    """In these runs the mode has a return of 7 and success in every episode."""
+    run = a_run(tmp_path / "a", with_success(TWO_SEEDS))
+    run.config |= {"observe": [0], "faults": {"noise": 0.3}}
+    returns, success = curve_figure(run).axes
+    for axis, sampled, mode in ((returns, [1.5, 5.5], [7.0, 7.0]), (success, [0.5, 0.5], [1.0, 1.0])):
+        means = {line.get_label(): line.get_ydata().tolist() for line in axis.lines if "actions" in line.get_label()}
+        assert means == {"sampled actions": sampled, "mode actions": mode}
+    assert returns.get_title(loc="left") == "vrm on pendulum-v observe 0 noise=0.3, mean and S.E.M. of 2 seeds"
+
+
 def test_agents_without_a_model_have_no_such_figure(two_tasks, tmp_path):
     with pytest.raises(UserError, match="model that keeps learning"):
         panels.draw_elbo(two_tasks, tmp_path / "picture")
@@ -322,7 +380,10 @@ def test_sensitivity_compares_the_papers_settings_with_those_drawn_for_each_seed
         if sources.drawn(seed) != sources.PAPERS:
             runs.append(a_run(tmp_path / f"drawn-{seed}", [flat(2.0)], first=seed, settings=sources.drawn(seed)))
     runs.append(a_run(tmp_path / "other", [flat(3.0)], first=99, settings={**sources.PAPERS, "seq_len": 7}))
-    usual, other = panels.pooled(groups(runs), sources.drawn, sources.PAPERS)
+    runs.append(a_run(tmp_path / "gamma", [flat(4.0)], first=0, settings={**sources.PAPERS, "gamma": 0.5}))
+    papers = {**sources.PAPERS, "gamma": 0.99}
+    usual, other = panels.pooled(groups(runs), sources.drawn, papers)
+    assert {run.folder.name for run, _ in usual.seeds} == {f"papers-{seed}" for seed in range(6)}
     assert [seed for _, seed in usual.seeds] == list(range(6))
     assert sorted(seed for _, seed in other.seeds) == list(range(6))
     with pytest.raises(UserError, match="not a sensitivity study"):

@@ -15,7 +15,7 @@ from beliefrl.analysis.aggregate import (
     profile,
     scores,
 )
-from beliefrl.analysis.groups import find, groups, is_finished, last_step
+from beliefrl.analysis.groups import find, groups, is_finished, last_step, left_out
 from beliefrl.types import UserError
 from inputs import a_run, flat
 
@@ -168,6 +168,16 @@ def test_runs_that_start_from_others_are_a_group_of_their_own(tmp_path):
     assert [group.label for group in groups(runs)] == ["vrm", "vrm init_from=runs/a"]
 
 
+def test_runs_with_other_options_are_groups_of_their_own_and_a_repetition_is_named(tmp_path):
+    runs = [a_run(tmp_path / name, [flat(1.0), flat(2.0)]) for name in ("a", "b", "c")]
+    runs[1].config["options"] |= {"envs": 8, "precision": "bfloat16"}
+    made = groups(runs)
+    assert [group.label for group in made] == ["vrm", "vrm envs=8 precision=bfloat16"]
+    assert left_out(runs, made) == [
+        f"left out: {tmp_path / 'c'}, seed 0 1: another run has the same settings and seed"
+    ] or left_out(runs, made) == [f"left out: {tmp_path / 'a'}, seed 0 1: another run has the same settings and seed"]
+
+
 # Aggregates over tasks, against their definitions (Agarwal et al. 2021).
 
 
@@ -209,6 +219,22 @@ def test_scores_are_between_a_random_policy_and_a_good_one(tmp_path):
     first, second = scores(groups(runs))["vrm"]
     np.testing.assert_allclose(first, [0.0, 1.0])
     np.testing.assert_allclose(second, [50 / 75, 100 / 75])
+
+
+@pytest.mark.parametrize(("diverged", "expected"), [([1], [1.0, 0.0]), ([0, 1], [0.0, 0.0])])
+def test_a_seed_that_diverged_scores_0_whatever_it_had_before(tmp_path, diverged, expected):
+    run = a_run(tmp_path / "a", [flat(-150.0), flat(-150.0)], task="pendulum", diverged=diverged)
+    np.testing.assert_allclose(scores(groups([run]))["vrm"], [expected])
+
+
+def test_a_task_on_which_all_seeds_diverged_at_once_still_counts(tmp_path):
+    runs = [
+        a_run(tmp_path / "a", [flat(-150.0)], task="pendulum"),
+        a_run(tmp_path / "b", [[]], task="pendulum", agent="slac", diverged=[0]),
+    ]
+    table = scores(groups(runs))
+    np.testing.assert_allclose(table["vrm"], [[1.0]])
+    np.testing.assert_allclose(table["slac"], [[0.0]])
 
 
 def test_bounds_are_of_a_task_its_masked_versions_and_its_faults():

@@ -91,11 +91,6 @@ def test_joint_layers_start_in_the_bounds_of_their_parts():
             assert float(jnp.std(leaf)) == pytest.approx(fan_in**-0.5 / 3**0.5, rel=0.1)
 
 
-def test_rest_continues_from_the_first_layer():
-    mlp, x = draw(jax.random.key(0), MLP((3, 8, 8, 2), jnp.tanh)), jnp.arange(3.0)
-    np.testing.assert_array_equal(mlp(x), mlp.rest(mlp.layers[0](x)))
-
-
 def test_layer_norm_removes_the_mean_and_the_scale_of_a_layer():
     one = draw(jax.random.key(1), MLP((3, 8, 2), jnp.tanh, normalise=True))
     x = np.asarray(one.layers[0](jnp.arange(3.0)))

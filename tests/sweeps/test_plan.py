@@ -1,13 +1,11 @@
 """The list of trainings in a sweep."""
 
-import dataclasses
 import json
 
 import pytest
 
 from beliefrl import tasks
 from beliefrl.runs.run import Recorder
-from beliefrl.sweeps import plan as plans
 from beliefrl.sweeps import sources
 from beliefrl.sweeps.plan import Experiment, extended, grid, plan, shrunk
 from beliefrl.sweeps.sources import load, read, write
@@ -251,8 +249,3 @@ def test_a_preset_takes_other_tasks_agents_and_seeds():
     assert [(each.agent, each.task, tuple(each.seeds)) for each in made] == [("vrm", "target-reaching", (8,))]
     with pytest.raises(UserError, match="no preset 'paper'"):
         sources.preset("paper")
-
-
-def test_the_options_that_a_sweep_knows_are_those_of_a_training():
-    assert {"steps", "eval_every", "track"} < set(plans.OPTIONS)
-    assert dataclasses.is_dataclass(plans.Options)

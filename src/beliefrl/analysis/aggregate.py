@@ -60,12 +60,14 @@ def scores(groups: Sequence[Group], mode: str = "sampled") -> dict[str, Scores]:
     Raises:
         UserError: there is no task that all labels have, or no group has an evaluation of all its seeds.
     """
-    groups = with_curve(groups, mode)
+    groups = [group for group in groups if group.diverged.all() or group.curve(mode).steps.size] or with_curve(
+        groups, mode
+    )
     labels = list(dict.fromkeys(group.label for group in groups))
     tasks = [task for task in tasks_of(groups) if {g.label for g in groups if g.task == task} == set(labels)]
     if not tasks:
         raise UserError("There is no task that all of these agents have: give runs on the same tasks.")
-    final = {(group.task, group.label): group.curve(mode).seeds[:, -1] for group in groups}
+    final = {(group.task, group.label): group.final(mode) for group in groups}
     table: dict[str, Scores] = {}
     for label in labels:
         table[label] = [_normalised(final[task, label], bounds(task, final)) for task in tasks]
@@ -74,7 +76,8 @@ def scores(groups: Sequence[Group], mode: str = "sampled") -> dict[str, Scores]:
 
 def bounds(task: str, final: dict[tuple[str, str], np.ndarray]) -> tuple[float, float]:
     """The returns that have the scores 0 and 1."""
-    best = max((float(np.nanmean(values)) for (of, _), values in final.items() if of == task), default=1.0)
+    of_task = [values for (of, _), values in final.items() if of == task]
+    best = max((float(np.nanmean(values)) for values in of_task if np.isfinite(values).any()), default=1.0)
     return known_bounds(task) or (0.0, best if best > 0 else 1.0)
 
 

@@ -133,6 +133,6 @@ def curve_figure(run: Run) -> Any:
         axis.spines[["top", "right"]].set_visible(False)
     count = len(run.seeds)
     spread = f"mean and S.E.M. of {count} seeds" if count > 1 else "1 seed"
-    axes[0].set_title(f"{run.config['agent']} on {run.config['task']}, {spread}", loc="left", fontsize=10)
+    axes[0].set_title(f"{run.config['agent']} on {group.task}, {spread}", loc="left", fontsize=10)
     axes[0].legend(frameon=False, loc="best", fontsize=9)
     return made

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from beliefrl.analysis import results
+from beliefrl.runs.options import Options
 from beliefrl.runs.run import Row, Run
 from beliefrl.types import UserError
 
@@ -47,12 +48,23 @@ class Group:
         """The evaluations of each seed, in the order of `seeds`."""
         return [list(run.rows(seed, "evaluation")) for run, seed in self.seeds]
 
+    @cached_property
+    def diverged(self) -> np.ndarray:
+        """Which seeds have diverged, (seed,)."""
+        return np.array([_diverged(run, seed) for run, seed in self.seeds])
+
     def curve(self, name: str = "sampled") -> Curve:
         """An entry of the evaluations (sampled, mode, sampled_success, ...), at steps that all seeds have."""
         table = [{row["step"]: float(np.mean(row[name])) for row in rows if name in row} for rows in self.evaluations]
-        healthy = [means for means, (run, seed) in zip(table, self.seeds, strict=True) if not _diverged(run, seed)]
+        healthy = [means for means, diverged in zip(table, self.diverged, strict=True) if not diverged]
         steps = sorted(set.intersection(*map(set, healthy or table)))
         return Curve(np.array(steps), np.array([[seed.get(step, np.nan) for step in steps] for seed in table]))
+
+    def final(self, name: str = "sampled") -> np.ndarray:
+        """The last values of a curve, (seed,); NaN for a seed that has diverged, and if there is no common step."""
+        curve = self.curve(name)
+        last = curve.seeds[:, -1] if curve.steps.size else np.full(len(self.seeds), np.nan)
+        return np.where(self.diverged, np.nan, last)
 
     @property
     def measures(self) -> list[str]:
@@ -133,7 +145,7 @@ def groups(
     else its default.
 
     If a seed was trained several times with the same settings, only the run with the most steps counts, and among equal
-    ones the latest: equal seed numbers give equal trainings, which must not count as several samples.
+    ones the latest, because such trainings are no independent samples. `left_out` has the others.
     """
     usual = {run.config["agent"]: (defaults or {}).get(run.config["agent"], {}) for run in runs}
     filled = {agent: usual[agent] | (before or {}).get(agent, {}) for agent in usual}
@@ -144,9 +156,7 @@ def groups(
         same_task = [other.config["constants"] for other in runs if task_of(other) == task_of(run)]
         task = " ".join([task_of(run), *_differences(run.config["constants"], same_task)])
         own = results.changed(settings[run.folder], usual[run.config["agent"]])
-        source = run.config["options"].get("init_from")
-        from_run = [f"init_from={source}"] if source else []
-        label = " ".join([run.config["agent"], *_differences(own, same_agent), *from_run])
+        label = " ".join([run.config["agent"], *_differences(own, same_agent), *_options(run)])
         of = seeds.setdefault((task, label), {})
         for seed in run.seeds:
             if seed not in of or _precedence(run, seed) > _precedence(of[seed], seed):
@@ -154,6 +164,26 @@ def groups(
     tasks, labels = ([*dict.fromkeys(names)] for names in zip(*seeds, strict=True)) if seeds else ([], [])
     merged = [Group(*names, [(of[seed], seed) for seed in sorted(of)]) for names, of in seeds.items()]
     return sorted(merged, key=lambda group: (tasks.index(group.task), labels.index(group.label)))
+
+
+OPTIONS = ("envs", "overlap", "init_from", "init_best", "precision", "replay_capacity")  # that can change a return
+
+
+def _options(run: Run) -> list[str]:
+    """NAME=VALUE of these options, if they differ from their defaults."""
+    given = {name: value for name, value in run.config["options"].items() if name in OPTIONS}
+    return [f"{name}={value}" for name, value in given.items() if value != getattr(Options, name)]
+
+
+def left_out(runs: Sequence[Run], shown: Sequence[Group]) -> list[str]:
+    """A sentence for each run with seeds that no group counts, because another run has them."""
+    counted = {(run.folder, seed) for group in shown for run, seed in group.seeds}
+    missing = {run.folder: [seed for seed in run.seeds if (run.folder, seed) not in counted] for run in runs}
+    return [
+        f"left out: {folder}, seed {' '.join(map(str, seeds))}: another run has the same settings and seed"
+        for folder, seeds in missing.items()
+        if seeds
+    ]
 
 
 def _precedence(run: Run, seed: int) -> tuple[int, str]:

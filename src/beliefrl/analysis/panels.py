@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from beliefrl.analysis.figures import axis_label, figure, save, standard_error
-from beliefrl.analysis.groups import Curve, Group
+from beliefrl.analysis.groups import Curve, Group, RunSeed
 from beliefrl.analysis.results import MODEL_LOSSES, means_between
 from beliefrl.types import UserError
 
@@ -183,20 +183,24 @@ def pooled(groups: Sequence[Group], drawn: Callable[[int], dict[str, Any]], pape
     Args:
         groups: runs of VRM.
         drawn: gives the drawn settings of a seed.
-        papers: the paper's settings.
+        papers: the paper's settings of all hyperparameters.
 
     Raises:
         UserError: no task has both a run with the paper's settings and a run with drawn settings.
     """
 
-    def has(run: Any, settings: dict[str, Any]) -> bool:
-        return all(run.config["hyperparameters"].get(name) == value for name, value in settings.items())
+    def of(seeds: Sequence[RunSeed], settings: Callable[[int], dict[str, Any]]) -> list[RunSeed]:
+        """Those with exactly these settings, each seed number once."""
+        return [
+            *{
+                seed: (run, seed) for run, seed in seeds if papers | run.config["hyperparameters"] == settings(seed)
+            }.values()
+        ]
 
     made = []
     for task in tasks_of(groups):
         seeds = [seed for group in groups if group.task == task and group.agent == "vrm" for seed in group.seeds]
-        usual = [(run, seed) for run, seed in seeds if has(run, papers)]
-        other = [(run, seed) for run, seed in seeds if has(run, drawn(seed))]
+        usual, other = of(seeds, lambda seed: papers), of(seeds, lambda seed: papers | drawn(seed))
         if usual and other:
             made += [Group(task, "vrm, the paper's settings", usual), Group(task, "vrm, drawn settings", other)]
     if not made:
@@ -237,16 +241,17 @@ def dashes(labels: Sequence[str]) -> dict[str, int]:
 
 
 def model_loss(group: Group) -> Curve | None:
-    """The model's loss, averaged over the updates between evaluations; None if no model keeps learning."""
+    """The model's loss, averaged over the updates between evaluations; None if no model keeps learning.
+
+    A seed without updates, which diverged before, is NaN.
+    """
     steps = group.curve().steps
-    table = []
-    for run, seed in group.seeds:
-        rows = list(run.rows(seed, "update"))
-        found = [name for name in MODEL_LOSSES if rows and name in rows[-1]]
-        if not found:
-            return None
-        table.append(means_between(rows, found[0], steps.tolist()))
-    return Curve(steps, np.array(table)).only(~np.all(np.isnan(table), axis=0))
+    updates = [list(run.rows(seed, "update")) for run, seed in group.seeds]
+    found = [name for name in MODEL_LOSSES if any(rows and name in rows[-1] for rows in updates)]
+    if not found:
+        return None
+    table = np.array([means_between(rows, found[0], steps.tolist()) for rows in updates])
+    return Curve(steps, table).only(~np.all(np.isnan(table), axis=0))
 
 
 def draw_elbo(groups: Sequence[Group], out: pathlib.Path, mode: str = "sampled") -> pathlib.Path:
@@ -261,15 +266,16 @@ def draw_elbo(groups: Sequence[Group], out: pathlib.Path, mode: str = "sampled")
     if not shown:
         raise UserError("None of these runs has a model that keeps learning: give runs of vrm, slac or predictive-sac.")
     colour = colours([group.label for group, _ in shown])
-    lines = {group.label: colour[group.label] for group, _ in shown} | {"loss of the model (dashed)": GREY}
+    dashed = "loss of the model (dashed)"
+    lines = {group.label: colour[group.label] for group, _ in shown} | {dashed: GREY}
     made, axes = panels(len(shown), [*lines])
     for axis, (group, loss) in zip(axes, shown, strict=True):
         draw_line(axis, group.curve(mode), colour[group.label], "return")
         finish(axis, f"{group.label} on {group.task}", "return")
         right = axis.twinx()
         draw_line(right, loss, GREY, "loss of the model", linestyle="--")
-        right.set_ylabel("loss of the model (dashed)", fontsize=9)
+        right.set_ylabel(dashed, fontsize=9)
         right.tick_params(labelsize=8)
         right.spines["top"].set_visible(False)
-    add_legend(made, lines, spread([group for group, _ in shown]))
+    add_legend(made, lines, spread([group for group, _ in shown]), {dashed: "--"})
     return save(made, out)

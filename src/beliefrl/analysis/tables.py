@@ -106,8 +106,8 @@ def final_rows(groups: Sequence[Group]) -> list[tuple[str, ...]]:
                 group.label,
                 counts([seed for _, seed in group.seeds]),
                 f"{sampled.steps[-1]:,}",
-                _final(sampled) + _measures(group, "sampled"),
-                _final(mode) + _measures(group, "mode"),
+                _final(group, "sampled") + _measures(group, "sampled"),
+                _final(group, "mode") + _measures(group, "mode"),
                 _solved(group.task, sampled, mode),
                 "unknown" if seconds is None else hours(seconds),
             )
@@ -115,14 +115,20 @@ def final_rows(groups: Sequence[Group]) -> list[tuple[str, ...]]:
     return table
 
 
-def _final(curve: Curve) -> str:
-    error = f" ± {standard_error(curve.seeds[:, -1:])[0]:.1f}" if len(curve.seeds) > 1 else ""
-    return f"{np.nanmean(curve.seeds[:, -1]):.1f}{error}"
+def _final(group: Group, mode: str) -> str:
+    """Mean ± S.E.M. of the seeds that have not diverged, and how many have."""
+    values = group.final(mode)[~group.diverged]
+    if not values.size:
+        return "diverged"
+    error = f" ± {standard_error(values):.1f}" if values.size > 1 else ""
+    lost = f" ({group.diverged.sum()} of {len(group.seeds)} diverged)" if group.diverged.any() else ""
+    return f"{values.mean():.1f}{error}{lost}"
 
 
 def _measures(group: Group, mode: str) -> str:
-    last = {name: float(np.nanmean(group.curve(f"{mode}_{name}").seeds[:, -1])) for name in group.measures}
-    return "".join(f"; {name} {measure_text(name, value)}" for name, value in last.items())
+    last = {name: group.final(f"{mode}_{name}") for name in group.measures}
+    known = {name: float(np.nanmean(values)) for name, values in last.items() if np.isfinite(values).any()}
+    return "".join(f"; {name} {measure_text(name, value)}" for name, value in known.items())
 
 
 def _solved(task: str, *curves: Curve) -> str:

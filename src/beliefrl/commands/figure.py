@@ -65,20 +65,20 @@ def figure(argv: Sequence[str]) -> None:
     options = parse(FigureOptions, argv[1:], f"beliefrl figure {kind}")
     runs, notes = _runs(options, kind)
     out = options.out or pathlib.Path(kind)
-    path = _draw(kind, runs, out, options.actions)
+    path, more = _draw(kind, runs, out, options.actions)
     if kind in TABLES:
         print(path.read_text(), end="")
-    for note in notes:
+    for note in notes + more:
         print(note)
     print(f"written to {path} and {path.with_suffix('.tex' if kind in TABLES else '.pdf').name}")
 
 
-def _draw(kind: str, runs: Sequence[Any], out: pathlib.Path, actions: str) -> pathlib.Path:
-    """Write the figure or table; returns the path of the PNG or of the Markdown file."""
+def _draw(kind: str, runs: Sequence[Any], out: pathlib.Path, actions: str) -> tuple[pathlib.Path, list[str]]:
+    """Write the figure or table; returns the path of the PNG or of the Markdown file, and what is left out."""
     from beliefrl import agents
     from beliefrl.analysis import aggregate, panels, tables
     from beliefrl.analysis.figures import curve_figure, save
-    from beliefrl.analysis.groups import groups
+    from beliefrl.analysis.groups import groups, left_out
     from beliefrl.sweeps import sources
     from beliefrl.types import UserError
 
@@ -87,17 +87,18 @@ def _draw(kind: str, runs: Sequence[Any], out: pathlib.Path, actions: str) -> pa
             raise UserError(
                 f"This figure shows one run: choose one of these {len(runs)} by --names, --agents or --tasks."
             )
-        return save(curve_figure(runs[0]), out)
+        return save(curve_figure(runs[0]), out), []
     lines = groups(runs, agents.defaults(), agents.before())
+    notes = left_out(runs, lines)
     if kind in TABLES:
-        return (tables.write_costs if kind == "scalability" else tables.write_final)(lines, out)
+        return (tables.write_costs if kind == "scalability" else tables.write_final)(lines, out), notes
     if kind == "elbo":
-        return panels.draw_elbo(lines, out, actions)
+        return panels.draw_elbo(lines, out, actions), notes
     if kind == "aggregate":
-        return aggregate.draw_aggregate(lines, out, actions)
+        return aggregate.draw_aggregate(lines, out, actions), notes
     if kind == "sensitivity":
-        lines = panels.pooled(lines, sources.drawn, sources.PAPERS)
-    return panels.draw_curves(lines, out, actions)
+        lines = panels.pooled(lines, sources.drawn, agents.defaults()["vrm"] | sources.PAPERS)
+    return panels.draw_curves(lines, out, actions), notes
 
 
 def _runs(options: FigureOptions, kind: str) -> tuple[list[Any], list[str]]:

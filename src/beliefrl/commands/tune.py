@@ -50,8 +50,8 @@ class TuneOptions:
     actions: Literal["sampled", "mode"] = "sampled"
     """Maximise returns with sampled actions, or with the policy's mode."""
     prune: bool = True
-    """Stop a trial whose objective is below the median of the others at the same evaluation. It begins after 5 complete
-    trials and a quarter of the training."""
+    """Stop a trial if its best objective so far is below the median of the complete trials at the same evaluation. It
+    begins after 5 complete trials and a quarter of the training."""
     out: pathlib.Path | None = None
     """The folder of the search and its runs. A search that is in it continues. None: runs/tune-AGENT-TASK."""
     workers: int | None = None

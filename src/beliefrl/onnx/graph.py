@@ -7,7 +7,7 @@ numbers. Every other primitive becomes nodes of the graph. A `scan` is unrolled.
 import functools
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jax
@@ -267,7 +267,7 @@ class _Graph:
             rest = [axis for axis in range(len(shape)) if axis not in (*axes, *shared)]
             order = [*shared, *(axes if side else rest), *(rest if side else axes)]
             turned = self.node("Transpose", value, perm=list(map(int, order)))
-            sizes = [math.prod(shape[axis] for axis in part) for part in ((axes, rest) if side else (rest, axes))]
+            sizes = [_product(shape[axis] for axis in part) for part in ((axes, rest) if side else (rest, axes))]
             factors.append(self.node("Reshape", turned, self.shape([*(shape[axis] for axis in shared), *sizes])))
             free.append(rest)
         return self.node("Reshape", self.node("MatMul", *factors), self.shape(out.shape))
@@ -291,6 +291,13 @@ def _like(aval: Any, number: int | float) -> Value:
 
 def _integers(*numbers: Any) -> Value:
     return lambda: np.array(numbers, np.int64)
+
+
+def _product(dimensions: Iterable[Any]) -> Any:
+    """The size of several axes together; -1, which the other sizes imply, if there are others beside the batch."""
+    dimensions = [size for size in dimensions if not (_is_fixed(size) and size == 1)]
+    mixed = len(dimensions) > 1 and not all(map(_is_fixed, dimensions))
+    return -1 if mixed else math.prod(dimensions)
 
 
 def _is_fixed(dimension: Any) -> bool:

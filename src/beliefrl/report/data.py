@@ -48,8 +48,11 @@ def page_data(runs: Sequence[Run], page_folder: pathlib.Path, unfinished: bool =
     an evaluation; the curve of a group then ends at the last step that all its seeds have reached.
     """
     counted = [run for run in runs if is_finished(run) or (unfinished and _has_begun(run))]
-    lines = [group for group in groups(counted, agents.defaults(), agents.before()) if group.curve().steps.size]
+    grouped = groups(counted, agents.defaults(), agents.before())
+    lines = [group for group in grouped if group.curve().steps.size]
     group_of = {(run.folder, seed): index for index, group in enumerate(lines) for run, seed in group.seeds}
+    placed = {(run.folder, seed) for group in grouped for run, seed in group.seeds}
+    elsewhere = {run.folder: [seed for seed in run.seeds if (run.folder, seed) not in placed] for run in counted}
     palette = colours([group.label for group in lines])
     dash = dashes(list(palette))
     return {
@@ -57,7 +60,9 @@ def page_data(runs: Sequence[Run], page_folder: pathlib.Path, unfinished: bool =
         "labels": [{"name": label, "colour": colour, "dash": dash[label]} for label, colour in palette.items()],
         "groups": [_group(group) for group in lines],
         "runs": [
-            _run(run, page_folder, {seed: group_of.get((run.folder, seed)) for seed in run.seeds}) for run in runs
+            _run(run, page_folder, [group_of.get((run.folder, seed)) for seed in run.seeds])
+            | {"elsewhere": elsewhere.get(run.folder, [])}
+            for run in runs
         ],
     }
 
@@ -79,11 +84,7 @@ def _group(group: Group) -> dict[str, Any]:
         "unfinished": not all(map(is_finished, group.runs)),
         "steps": int(group.curve().steps[-1]),
         "curves": {name: _curve(curve) for name, curve in curves.items()},
-        "final": {
-            name: statistics(curve.seeds[:, -1] if len(diverged) < len(group.seeds) else np.array([]))
-            for name, curve in curves.items()
-            if curve.steps.size
-        },
+        "final": {name: statistics(group.final(name)) for name, curve in curves.items() if curve.steps.size},
     }
 
 
@@ -122,7 +123,7 @@ def number(value: float) -> float | None:
     return float(f"{value:.7g}") if np.isfinite(value) else None
 
 
-def _run(run: Run, page_folder: pathlib.Path, groups_of: dict[int, int | None]) -> dict[str, Any]:
+def _run(run: Run, page_folder: pathlib.Path, groups_of: Sequence[int | None]) -> dict[str, Any]:
     config = run.config
     sessions = [config, *config.get("resumed", ())]
     steps = {seed: last_step(run, seed) for seed in run.seeds}
@@ -130,8 +131,7 @@ def _run(run: Run, page_folder: pathlib.Path, groups_of: dict[int, int | None]) 
         "folder": str(run.folder),
         "agent": config["agent"],
         "task": config["task"],
-        "group": next((index for index in groups_of.values() if index is not None), None),
-        "not_counted": [seed for seed, index in groups_of.items() if index is None],
+        "group": next((index for index in groups_of if index is not None), None),
         "finished": is_finished(run),
         "seeds": run.seeds,
         "steps": max(steps.values(), default=0),

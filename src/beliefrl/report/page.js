@@ -148,8 +148,8 @@ function runDetails(run) {
   );
   const notes = [
     ...run.diverged,
-    ...(run.finished && run.not_counted.length
-      ? [`seeds ${list(run.not_counted)} are taken from another run with the same settings`]
+    ...(run.elsewhere.length
+      ? [`seeds ${list(run.elsewhere)} are taken from another run with the same settings`]
       : []),
   ];
   return [

@@ -160,8 +160,7 @@ class Run:
         if path.exists():
             return path
         if best and any(row for seed in self.seeds for row in self.rows(seed, "evaluation")):
-            why = "an older version trained it, which kept only the last agent"
-            raise UserError(f"{self.folder} has no best agent ({why}): leave out --best, in Python best=.")
+            raise UserError(f"{self.folder} has only its last agent: leave out --best, in Python best=.")
         which = "best" if best else "trained"
         raise UserError(f"{self.folder} has no {which} agent yet: it is saved at the first evaluation.")
 

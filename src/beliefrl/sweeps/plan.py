@@ -251,14 +251,15 @@ def _split(settings: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any],
 
 def _check(trainings: Iterable[Training]) -> None:
     """Raise a UserError for any invalid training, before the first one starts."""
-    specs: dict[str, Any] = {}
+    known: set[str] = set()
     for training in trainings:
         agent = agent_of(training.agent, training.settings)
         capacity(agent, Options(**_typed(training.options, Options)))
         task = [training.task, training.observe or None, training.faults, training.constants]
         key = json.dumps(plain(task), sort_keys=True)
-        if key not in specs:
-            specs[key] = tasks.make(*task[:3], **training.constants).spec
+        if key not in known:
+            known.add(key)
+            _ = tasks.make(*task[:3], **training.constants).spec  # making an environment may fail
 
 
 def agent_of(name: str, hyperparameters: dict[str, Any]) -> Any:

@@ -234,17 +234,21 @@ class _Loop:
         self.launcher.start(training)
 
     def _watch(self, name: str) -> None:
-        """Report the new evaluations of a trial; stop it if Optuna prunes it."""
+        """Report the new evaluations of a trial; stop it if Optuna prunes it, or if a seed has diverged."""
         trial, steps = self.trials[name], self.status.running[name].steps
         if name in self.is_poor or not (self.folder / name / "config.json").exists():
             return
-        returns = self.search.returns(Run(self.folder / name))
-        learned = [step for step in returns if self.search.agent.step_start_rl < step < steps]
-        for count, step in enumerate(learned, 1):
+        run = Run(self.folder / name)
+        if _has_diverged(run):
+            self.is_poor.add(name)
+            self.launcher.interrupt(name)
+            return
+        returns = self.search.returns(run)
+        for step in [each for each in returns if self.search.agent.step_start_rl < each < steps]:
             number = step // self.search.every
             if number not in self.reported[name]:
                 self.reported[name].add(number)
-                trial.report(self.search.value([returns[each] for each in learned[:count]]), number)
+                trial.report(self.search.value([value for at, value in returns.items() if at <= step]), number)
                 if trial.should_prune():
                     self.is_poor.add(name)
                     self.launcher.interrupt(name)
@@ -256,7 +260,7 @@ class _Loop:
         for name, code in self.launcher.ended().items():
             training, trial = self.status.running.pop(name), self.trials.pop(name)
             run = Run(self.folder / name) if (self.folder / name / "config.json").exists() else None
-            diverged = run is not None and any(True for seed in run.seeds for _ in run.rows(seed, "diverged"))
+            diverged = run is not None and _has_diverged(run)
             returns = [] if run is None else list(self.search.returns(run).values())
             if diverged or (code and name in self.is_poor):
                 self.study.tell(trial, state=states.PRUNED)
@@ -280,3 +284,7 @@ class _Loop:
         if len(self.status.failed) >= PATIENCE and not (self.status.finished or self.status.pruned):
             logs = f"fix the cause; {self.folder}/logs has the output of each"
             raise UserError(f"The first {len(self.status.failed)} trials failed ({why.rstrip('.')}): {logs}.")
+
+
+def _has_diverged(run: Run) -> bool:
+    return any(True for seed in run.seeds for _ in run.rows(seed, "diverged"))
