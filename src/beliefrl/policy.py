@@ -174,7 +174,8 @@ class Policy:
 
         The name of the file decides its format. A name that ends in .onnx gives an ONNX graph, which runs without JAX,
         for example in onnxruntime, and takes the mode of the policy (`beliefrl.onnx`). It is compared in an
-        episode with this policy, computed in float32. Any other name gives a file for `jax.export`, for CPUs and NVIDIA GPUs:
+        episode with this policy, computed in float32. Any other name gives a file for `jax.export`, for CPUs and NVIDIA
+        GPUs:
 
             policy = jax.export.deserialize(pathlib.Path("policy.jax").read_bytes())
             action, state = policy.call(obs, reward, state, episode_start, seed, deterministic)
