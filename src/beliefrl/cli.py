@@ -12,7 +12,7 @@ HELP = """usage: beliefrl COMMAND ...
 Reinforcement learning under partial observability: the agent observes only a part of the state.
 
   beliefrl demo [TASK]          watch a small trained agent that comes with the package
-  beliefrl check TASK           a task's observations, actions and rewards, and why a training would refuse it
+  beliefrl check TASK           a task's observations, actions and rewards, and whether you can train on it
   beliefrl train AGENT TASK     train, with a live view, into a run's folder
   beliefrl resume RUN           continue a training that was stopped or killed, or train it longer
   beliefrl sweep --preset NAME  many trainings: agents x tasks x settings x seeds, on all cores or a Ray cluster
@@ -32,10 +32,10 @@ Reinforcement learning under partial observability: the agent observes only a pa
 
 for example
 
-  beliefrl train vrm pendulum-v --steps 15000 --seeds 3 --out runs/first
+  beliefrl train predictive-sac pendulum-v --steps 15000 --seeds 3 --out runs/first
   beliefrl evaluate runs/first --episodes 20
   beliefrl train vrm target-reaching --steps 60000 --gamma 0.98
-  beliefrl train vrm gym:MountainCarContinuous-v0 --observe 0 --seeds 2
+  beliefrl train predictive-sac gym:MountainCarContinuous-v0 --observe 0 --seeds 2
   beliefrl train my_module:MyAgent pendulum-p
 
 COMMAND --help shows the options of a command; `beliefrl train AGENT --help` also the agent's hyperparameters,

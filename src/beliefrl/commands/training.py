@@ -31,7 +31,7 @@ Constants = Annotated[
 
 @dataclasses.dataclass(frozen=True)
 class CheckOptions:
-    """Show a task's observations, actions and rewards, and why a training would refuse it. Takes random steps in it."""
+    """Show a task's observations, actions and rewards, and whether you can train on it. Takes random steps in it."""
 
     task: TaskName
     observe: Observe = ()

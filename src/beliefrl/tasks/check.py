@@ -63,7 +63,7 @@ class TaskCheck:
     warnings: tuple[str, ...] = ()
     """Sentences about suspicious properties; the training does not refuse the task for them."""
     refusals: tuple[str, ...] = ()
-    """Sentences that say why a training would refuse the task; empty if it would not."""
+    """Sentences that say why the agent cannot be trained on the task; empty if it can."""
 
     def __repr__(self) -> str:
         """The tables and sentences as plain text."""
@@ -98,7 +98,7 @@ class TaskCheck:
 def check(
     task: Any, observe: Sequence[int | str] | int | str | None = None, steps: int = 200, seed: int = 0, **constants: Any
 ) -> TaskCheck:
-    """Take random steps in a task. Report its observations, actions and rewards, and why a training would refuse it.
+    """Take random steps in a task. Report its observations, actions and rewards, and what prevents a training.
 
         print(beliefrl.check("gym:Pendulum-v1", observe=[0, 1]))
 
