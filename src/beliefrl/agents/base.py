@@ -190,6 +190,11 @@ class SACAgent(ControllerAgent):
         controller, state = update(self.optimisers, state, controller, gradient, self.tau)
         return controller, state, metrics
 
+    def update(self, state: Any, batch: Any, key: Key[Array, ""]) -> tuple[Any, Metrics]:
+        """One update of the controller, of a state with `controller` and `controller_optimiser`."""
+        controller, optimiser, metrics = self.learn_controller(state.controller, state.controller_optimiser, batch, key)
+        return state._replace(controller=controller, controller_optimiser=optimiser), metrics
+
 
 def standardise_beliefs(scale: RunningStatistics | None, batch: Batch) -> tuple[RunningStatistics | None, Batch]:
     """The statistics after a batch (or a cycle's batches), and the batch standardised with them.

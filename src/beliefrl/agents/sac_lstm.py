@@ -119,9 +119,7 @@ class SACLSTMAgent(SACAgent):
     def act(
         self, state: State, memory: LSTMState, step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]
     ) -> tuple[Float[Array, " action"], LSTMState]:
-        start = jax.tree.map(lambda leaf: leaf[None], memory)
-        after = state.lstm.unroll(start, self.perception(step)[None, None], step.is_first[None, None])
-        memory = jax.tree.map(lambda leaf: leaf[0, 0], after)
+        memory = state.lstm.step(memory, self.perception(step), step.is_first)
         return self.choose(state.controller, memory.d, key, explore), memory
 
     def note(self, memory: LSTMState) -> tuple[()]:

@@ -92,7 +92,3 @@ class SACMLPAgent(SACAgent):
     def batch(self, windows: Window) -> Batch:
         """The windows' first transitions."""
         return jax.tree.map(lambda leaf: leaf[0], self.transitions(windows, windows.step.obs))
-
-    def update(self, state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
-        controller, optimiser, metrics = self.learn_controller(state.controller, state.controller_optimiser, batch, key)
-        return state._replace(controller=controller, controller_optimiser=optimiser), metrics

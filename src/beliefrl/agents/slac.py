@@ -213,10 +213,6 @@ class SLACAgent(SACAgent):
         actor_input = x[index, jnp.arange(x.shape[1])].swapaxes(1, 2)
         return actor_input.reshape(*actor_input.shape[:2], -1)
 
-    def update(self, state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
-        controller, optimiser, metrics = self.learn_controller(state.controller, state.controller_optimiser, batch, key)
-        return state._replace(controller=controller, controller_optimiser=optimiser), metrics
-
 
 def begin_windows(windows: Window) -> Window:
     """The windows (time-major), each as the beginning of an episode. First timesteps have no previous action."""

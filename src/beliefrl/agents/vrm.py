@@ -288,7 +288,3 @@ class VRMAgent(SACAgent):
             parts.insert(0, windows.note[0] if stored else states(state.first, windows, of_first).d)
         belief = jnp.concatenate([part[self.burn_in :] for part in parts], axis=-1)
         return split_updates(self.transitions(windows, belief), self.batch_size)
-
-    def update(self, state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
-        controller, optimiser, metrics = self.learn_controller(state.controller, state.controller_optimiser, batch, key)
-        return state._replace(controller=controller, controller_optimiser=optimiser), metrics

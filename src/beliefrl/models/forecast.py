@@ -23,7 +23,7 @@ def perceive(
     excess = jnp.where(step.is_first, 0.0, scales.usual.excess(step.reward))
     rewards = remember(before[1], excess, constants)
     inputs = scales.model_input(scales.perception(step), rewards)
-    return model.next_state(before[0], inputs, step.is_first), rewards
+    return model.lstm.step(before[0], inputs, step.is_first), rewards
 
 
 def forecast(

@@ -152,6 +152,12 @@ class LSTM(eqx.Module):
         given = given + jnp.broadcast_to(self.bias, given.shape)
         return unroll(LSTM_CELL, self.w_d, start, given, is_first, None)
 
+    def step(self, before: LSTMState, x: Float[Array, " input"], is_first: Bool[Array, ""]) -> LSTMState:
+        """The state after one more step, leaves (d,)."""
+        start = jax.tree.map(lambda leaf: leaf[None], before)
+        after = self.unroll(start, x[None, None], is_first[None, None])
+        return jax.tree.map(lambda leaf: leaf[0, 0], after)
+
 
 def _lstm_forward(w_d, before, given, noise):
     state, slopes = lstm_step(given + before.d @ w_d, before.c)

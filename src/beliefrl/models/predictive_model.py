@@ -29,7 +29,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.models.nets import LSTM, MLP, LSTMState, draw
+from beliefrl.models.nets import LSTM, MLP, draw
 from beliefrl.models.soft_actor_critic import valid_mean
 
 UNUSUAL = 5  # mean absolute deviations from the median at which a reward is unusual
@@ -45,12 +45,6 @@ class PredictiveModel(eqx.Module):
         """Sizes of o_t, a_t, m_t, the state of the LSTM, and the hidden layer of the predictor."""
         self.lstm = LSTM(obs + action + 1 + memories, d)
         self.predictor = MLP((d + action, hidden, obs + 1), jax.nn.relu)
-
-    def next_state(self, state: LSTMState, x: Float[Array, " input"], is_first: Bool[Array, ""]) -> LSTMState:
-        """The LSTM's state after [x_t, m_t / σ_r]."""
-        start = jax.tree.map(lambda leaf: leaf[None], state)
-        after = self.lstm.unroll(start, x[None, None], is_first[None, None])
-        return jax.tree.map(lambda leaf: leaf[0, 0], after)
 
     def predict(self, d: Float[Array, " d"], action: Float[Array, " action"]) -> Float[Array, " prediction"]:
         """(o_{t+1}, r_t) in standardised units, given h_t and a_t."""
