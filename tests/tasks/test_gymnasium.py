@@ -1,8 +1,11 @@
 """Gymnasium environments as tasks: observations and actions, supported spaces, and one clear message per fault."""
 
 import dataclasses
+import os
+import pathlib
 
 import gymnasium
+import jax
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -10,6 +13,7 @@ from gymnasium import spaces
 from beliefrl import catalogue, tasks
 from beliefrl.tasks import gymnasium as adapter
 from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
+from beliefrl.tasks.interface import Interface
 from beliefrl.training.lockstep import Lockstep
 from beliefrl.types import UserError
 from wrong import BOX, FAULTS, UNSUPPORTED, Dictionary, Fine, spaced
@@ -45,6 +49,48 @@ def test_a_fault_names_the_environment_the_seed_and_the_step(make, monkeypatch):
     assert text.startswith(f"robot (seed 4, step {step}): ")
     assert phrase in text
     lanes.close()
+
+
+def test_another_interface_is_an_error_that_names_what_differs():
+    trained = Interface(("angle", "entry 1"), [-1.0], [1.0])._asdict()
+    Interface(("angle", "speed"), [-1.0], [1.0]).check(trained, "runs/one")  # an entry without a name fits any
+    Interface(("angle",), [-9.0], [9.0]).check(None, "runs/one")  # of an older run nothing is known
+    for other, phrase in (
+        (Interface(("angle",), [-1.0], [1.0]), "number of observed entries before: 2, now: 1"),
+        (Interface(("speed", "entry 1"), [-1.0], [1.0]), r"observed entries before: \['angle'\], now: \['speed'\]"),
+        (
+            Interface(("angle", "entry 1"), [-2.0], [1.0]),
+            r"lower bounds of the actions before: \[-1.0\], now: \[-2",
+        ),
+        (Interface(("angle", "entry 1"), [-1.0], [2.0]), "upper bounds of the actions"),
+    ):
+        with pytest.raises(UserError, match=f"^runs/one was trained in another environment: {phrase}"):
+            other.check(trained, "runs/one")
+
+
+def test_the_interface_has_the_entries_that_the_agent_sees_and_the_bounds_of_its_actions():
+    class Named(Fine):
+        entry_names = ("angle", "speed")
+
+    assert GymnasiumTask(Named, indices=(1,)).interface == (("speed",), [-2.0], [6.0])
+    assert GymnasiumTask(Fine).interface.entries == ("entry 0", "entry 1")
+
+
+def test_making_an_environment_changes_neither_the_working_directory_nor_jax(tmp_path, monkeypatch):
+    class Moving(Fine):
+        def __init__(self):
+            os.chdir("/")
+            jax.config.update("jax_enable_x64", True)
+
+    monkeypatch.chdir(tmp_path)
+    assert GymnasiumTask(Moving).spec.obs_dim == 2
+    assert pathlib.Path.cwd() == tmp_path
+    assert not jax.config.jax_enable_x64
+
+
+def test_a_text_in_place_of_a_tuple_of_measures_is_an_error(unchecked):
+    with pytest.raises(UserError, match=r"measures='success' is a text: give a tuple, \('success',\)"):
+        GymnasiumTask(Fine, measures="success")
 
 
 def test_options_of_a_reset_are_none_also_at_a_restart():

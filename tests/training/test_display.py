@@ -1,5 +1,6 @@
 """What a training shows, phase by phase: in a log, in a terminal and in a notebook."""
 
+import errno
 import io
 import re
 import sys
@@ -87,6 +88,17 @@ def test_a_log_gets_a_line_where_nothing_else_was_printed_for_a_minute(run, monk
 
 
 @pytest.mark.nightly
+def test_a_training_goes_on_if_its_output_cannot_be_written():
+    class Full(io.StringIO):
+        def write(self, text):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    shown = Screen(Console(file=Full(), force_terminal=False))
+    for _ in range(2):
+        shown.line("step 1")
+    assert shown.console.quiet
+
+
 def test_a_training_from_python_shows_its_phases_and_evaluations(tmp_path, capsys):
     train(AGENT, "pendulum", tmp_path / "run", **OPTIONS)
     out = capsys.readouterr().out

@@ -244,6 +244,33 @@ def test_a_training_goes_on_from_a_fault(tmp_path, episodes):
         assert (steps[0], steps[-1]) == ((26, 40) if episodes == 2 else (40, 40))
 
 
+class Wider(Fine):
+    """The same with other bounds of the action."""
+
+    action_space = spaces.Box(-2.0, 60.0, (1,), np.float32)
+
+
+class Moving(Fine):
+    """Changes the working directory, as simulators do that look for their files."""
+
+    def reset(self, *, seed=None, options=None):
+        os.chdir("/")
+        return super().reset(seed=seed, options=options)
+
+
+@pytest.mark.slow
+def test_a_run_is_where_it_was_said_to_be_and_is_not_opened_with_other_actions(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    agent = agents.make("sac-mlp", **SHARED, **SMALL["sac-mlp"])
+    train(agent, GymnasiumTask(Moving, "robot"), "run", **few(steps=20, eval_every=20))
+    assert (tmp_path / "run" / "results.json").exists()
+    monkeypatch.chdir(tmp_path)
+    load("run", task=GymnasiumTask(Fine, "robot"))
+    for other in (resume, load):
+        with pytest.raises(UserError, match=r"upper bounds of the actions before: \[6.0\], now: \[60"):
+            other("run", task=GymnasiumTask(Wider, "robot"))
+
+
 class Single(Fine):
     """At most two at a time, one for each seed: there is none left for evaluations."""
 

@@ -8,6 +8,8 @@ import time
 
 import pytest
 
+from beliefrl.training import stop
+
 SLEEPER = """
 import hashlib
 from beliefrl.training.stop import Requests
@@ -29,6 +31,28 @@ def test_a_second_signal_ends_the_program_at_once():
             assert process.wait(timeout=20) == 130
         finally:
             process.kill()
+
+
+def test_ctrl_c_waits_while_a_program_imports():
+    """Raised in an import, it could be lost; it comes at the end, or where a training looks for requests."""
+    steps = []
+    with pytest.raises(KeyboardInterrupt), stop.waiting():  # noqa: PT012
+        os.kill(os.getpid(), signal.SIGINT)
+        steps.append("imported")
+    assert steps == ["imported"]
+    with pytest.raises(KeyboardInterrupt), stop.waiting():  # noqa: PT012
+        os.kill(os.getpid(), signal.SIGINT)
+        with stop.Requests() as requests:
+            assert requests.number == signal.SIGINT
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_handler_that_an_environment_has_installed_is_replaced():
+    with stop.Requests() as requests:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        requests.renew()
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert requests.number == signal.SIGTERM
 
 
 ANSWERING = """

@@ -176,6 +176,13 @@ def parse(options: Any, argv: Sequence[str], prog: str, advice: str = "") -> Any
     return parsed
 
 
+def refuse_empty(argv: Sequence[str], *options: str) -> None:
+    """Raise a UsageError if one of these options is given without a value, for example an empty variable of a shell."""
+    for option, after in zip(argv, [*argv[1:], "-"], strict=True):
+        if option in options and after.startswith("-"):
+            raise UsageError(f"{option} needs a value: give one, or leave the option out.")
+
+
 def named_values(given: Sequence[str], option: str) -> dict[str, Any]:
     """{"name": value} of NAME=VALUE arguments. A value is parsed as JSON; if that fails, it is a string."""
     values = {}
@@ -183,6 +190,8 @@ def named_values(given: Sequence[str], option: str) -> dict[str, Any]:
         name, separator, value = each.partition("=")
         if not (separator and name.isidentifier()):
             raise UsageError(f"{option} {each} cannot be understood: write NAME=VALUE, such as max_episode_steps=500.")
+        if name in values:
+            raise UsageError(f"{option} has {name} twice: give it once.")
         if name in ("name", "observe", "faults"):  # arguments of `tasks.make` that are not constants
             raise UsageError(
                 f"{option} {each} is impossible: name, observe and faults are not constants of a task: use TASK, "

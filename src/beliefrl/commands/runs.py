@@ -1,8 +1,10 @@
 """Commands on a run: `beliefrl show`, `evaluate` and `export`."""
 
+import contextlib
 import dataclasses
 import json
 import pathlib
+import sys
 from collections.abc import Sequence
 from typing import Annotated
 
@@ -82,7 +84,9 @@ def evaluate(argv: Sequence[str]) -> None:
 
     run = Run(options.run)
     agent, shown = own_agent(options.agent), not options.json
-    results = play(run, options.episodes, options.seed, agent=agent, progress=shown, best=options.best)
+    elsewhere = contextlib.redirect_stdout(sys.stderr) if options.json else contextlib.nullcontext()
+    with elsewhere:  # what an environment prints
+        results = play(run, options.episodes, options.seed, agent=agent, progress=shown, best=options.best)
     if options.json:
         print(json.dumps(json.loads(json.dumps(results), parse_constant=lambda _: None)))  # null for a diverged seed
         return

@@ -8,7 +8,16 @@ from typing import Annotated, Literal
 import tyro
 
 from beliefrl import catalogue
-from beliefrl.commands.arguments import OwnAgent, agent_name, agent_options, named_values, own_agent, parse
+from beliefrl.commands.arguments import (
+    OwnAgent,
+    agent_name,
+    agent_options,
+    named_values,
+    own_agent,
+    parse,
+    refuse_empty,
+)
+from beliefrl.training.stop import waiting
 
 NewLimit = Annotated[float | Literal["same"] | None, tyro.conf.arg(metavar="FLOAT|None|same")]
 TaskName = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK", help="`beliefrl tasks` lists them.")]
@@ -62,6 +71,7 @@ class ResumeOptions:
 def check(argv: Sequence[str]) -> None:
     """`beliefrl check TASK ...`."""
     options = parse(CheckOptions, argv, "beliefrl check")
+    refuse_empty(argv, "--observe", "--constants")
     from rich.console import Console
 
     from beliefrl import tasks
@@ -75,6 +85,7 @@ def check(argv: Sequence[str]) -> None:
         raise UserError(" ".join(found.refusals))
 
 
+@waiting()
 def train(argv: Sequence[str]) -> None:
     """`beliefrl train AGENT TASK ...`."""
     name, rest = agent_name(argv, "train", "TASK")
@@ -112,6 +123,7 @@ def train(argv: Sequence[str]) -> None:
         },
     )
     options = parse(options_type, rest, f"beliefrl train {name}")
+    refuse_empty(rest, "--observe", "--constants")
     constants = named_values(options.constants, "--constants")
     task = tasks.make(options.task, options.observe or None, options.faults, **constants)
     run_training(
@@ -124,6 +136,7 @@ def train(argv: Sequence[str]) -> None:
     )
 
 
+@waiting()
 def resume(argv: Sequence[str]) -> None:
     """`beliefrl resume RUN ...`."""
     kept = (

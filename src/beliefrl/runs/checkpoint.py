@@ -267,7 +267,7 @@ def _check(path: pathlib.Path, size: int, sha256: str) -> None:
     try:
         content = path.read_bytes()
     except FileNotFoundError:
-        content = b""
+        raise Damaged(f"{path} is missing.") from None
     except OSError as error:
         raise arrays.unreadable(path, error) from None
     if len(content) != size or _sha256(content) != sha256:

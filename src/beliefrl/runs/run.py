@@ -69,10 +69,15 @@ class Run:
         given = tuples(self.config["options"])
         return Options(**{name: value for name, value in given.items() if name in known})
 
+    @property
+    def shown(self) -> str:
+        """The folder as it was given, for messages."""
+        return str(self.folder)
+
     def __repr__(self) -> str:
         """The folder, the agent and the task: `<Run runs/first: vrm on pendulum-v>`."""
         agent, task = one_line(str(self.config["agent"])), one_line(str(self.config["task"]))
-        return f"<Run {self.folder}: {agent} on {task}>"
+        return f"<Run {self.shown}: {agent} on {task}>"
 
     @property
     def seeds(self) -> list[int]:
@@ -175,7 +180,8 @@ class Recorder(Run):
             UserError: the folder exists already or cannot be made (with a config), does not exist (without), or is
                 written by another process; or a tracker cannot be opened.
         """
-        folder = pathlib.Path(folder)
+        self._given = str(folder)
+        folder = pathlib.Path.cwd() / folder  # an environment may change the working directory
         if config is not None:
             make(folder, config)
         super().__init__(folder)
@@ -187,6 +193,10 @@ class Recorder(Run):
                 stack.push(self)
                 self._open()
                 stack.pop_all()
+
+    @property
+    def shown(self) -> str:
+        return self._given
 
     def __enter__(self) -> "Recorder":
         return self

@@ -217,7 +217,7 @@ def _make_declared(name: str, constants: dict[str, Any]) -> Any:
     """A task of an installed package, or a version of it with a part of the observation."""
     found = _declared(name)
     if found is None:
-        near = _similar(name)
+        near = _similar(name) or (f"{PREFIX}{name}" if ":" in name else None)
         hint = f"did you mean {near}?" if near else "`beliefrl tasks` lists them all."
         raise UserError(f"There is no task {name!r}: {hint}")
     base, value = found

@@ -6,16 +6,20 @@ episodes follow the same rules as those of `rollout`. This module checks everyth
 
 import contextlib
 import dataclasses
+import multiprocessing
+import os
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any
 
 import gymnasium
+import jax
 import numpy as np
 from gymnasium import spaces
 
 from beliefrl.catalogue import our_task_names
 from beliefrl.tasks.faults import NONE, STREAM, Draws, Faults
+from beliefrl.tasks.interface import Interface
 from beliefrl.tasks.spaces import check_actions, fits, flat_bounds, flat_size, limits, observation_names
 from beliefrl.types import LARGEST, Spec, UserError, as_array, check_indices, check_range, said, short
 
@@ -51,6 +55,8 @@ class GymnasiumTask:
 
     def __post_init__(self) -> None:
         """Set the default name. Raise a UserError for an impossible time limit, or if `make` makes no environments."""
+        if isinstance(self.measures, str):
+            raise UserError(f"measures={self.measures!r} is a text: give a tuple, ({self.measures!r},).")
         if not callable(self.make):
             raise UserError(f"GymnasiumTask needs a class or function that makes environments, not {short(self.make)}.")
         if self.max_steps is not None:
@@ -62,28 +68,35 @@ class GymnasiumTask:
             object.__setattr__(self, "name", name)
 
     @cached_property
+    def _seen(self) -> tuple[Spec, Interface]:
+        with contextlib.chdir(os.curdir):  # an environment may change it
+            environment = self.environment()
+        names = observation_names(environment.inner, environment.inner_observation_space, self.name)
+        actions = environment.inner_action_space
+        environment.close()
+        seen = tuple(names[index] for index in environment.indices)
+        size = self.faults.observed_size(environment.indices.size)
+        spec = Spec(size, actions.low.size, environment.limit or LARGEST, self.measures)
+        return spec, Interface(seen, actions.low.ravel().tolist(), actions.high.ravel().tolist())
+
+    @property
     def spec(self) -> Spec:
         """Sizes of the observation and the action, and the time limit in steps.
 
         Raises:
             UserError: the environment cannot be made, or its spaces are not supported.
         """
-        environment = self.environment()
-        environment.close()
-        size = self.faults.observed_size(environment.indices.size)
-        return Spec(size, environment.inner_action_space.low.size, environment.limit or LARGEST, self.measures)
+        return self._seen[0]
 
-    @cached_property
+    @property
+    def interface(self) -> Interface:
+        """What the agent sees and does; raises as `spec`."""
+        return self._seen[1]
+
+    @property
     def entry_names(self) -> tuple[str, ...]:
-        """The name of each entry that the agent sees, if the environment offers names; "entry 2" if not.
-
-        Raises:
-            UserError: the environment cannot be made, or its spaces are not supported.
-        """
-        environment = self.environment()
-        names = observation_names(environment.inner, environment.inner_observation_space, self.name)
-        environment.close()
-        return tuple(names[index] for index in environment.indices)
+        """The name of each entry that the agent sees; raises as `spec`."""
+        return self.interface.entries
 
     def environment(self, seed: str = "") -> "Environment":
         """Make one environment, as the agent sees it. `seed` identifies it in error messages.
@@ -100,12 +113,16 @@ class GymnasiumTask:
         Raises:
             UserError: the environment cannot be made.
         """
+        wide = jax.config.jax_enable_x64
         try:
             return self.make(**self.arguments)
         except UserError:
             raise
         except Exception as error:  # an environment may raise anything
             raise UserError(f"{self.name} cannot be made: {said(error)}.") from None
+        finally:
+            if multiprocessing.parent_process() is None:  # elsewhere it may compute as it likes
+                jax.config.update("jax_enable_x64", wide)
 
 
 class Environment(gymnasium.Env[np.ndarray, np.ndarray]):

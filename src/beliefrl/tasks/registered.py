@@ -68,7 +68,7 @@ def _import(package: str, id: str) -> None:
             importlib.import_module(package)
     except ModuleNotFoundError as found:
         raise UserError(_missing(id, found)) from None
-    except Exception as found:  # a module may raise anything
+    except (Exception, SystemExit) as found:  # a module may raise anything
         raise UserError(f"The module {package} cannot be imported: {said(found)}.") from None
 
 

@@ -56,7 +56,7 @@ class TrainingDisplay:
         if event.note is not None:
             self.screen.line(event.note)
             return
-        if event.phase not in (Phase.EVALUATING, self.phase):
+        if event.phase not in (Phase.EVALUATING, Phase.FINISHED, self.phase):
             self._begin_phase(event, now)
         if event.episodes is not None and np.any(event.episodes.done):
             ended = np.asarray(event.episodes.episode_return)[np.asarray(event.episodes.done)]
@@ -116,12 +116,12 @@ class TrainingDisplay:
         """Show the results of a training, and its folder."""
         run, results = self.run, self.run.results()
         if not results:  # stopped before the first evaluation
-            self.screen.show(f"saved in {run.folder}")
+            self.screen.show(f"saved in {run.shown}")
             return
         title = f"{run.config['agent']} on {run.config['task']} after {results['step']:,} steps"
         self.screen.show(results_table(results, run.seeds, title))
         command = f"`beliefrl evaluate {as_argument(run)}`"
-        self.screen.show(f"saved in {run.folder}: see curve.png; {command} plays more episodes")
+        self.screen.show(f"saved in {run.shown}: see curve.png; {command} plays more episodes")
 
 
 def results_table(results: dict[str, Any], seeds: list[int], title: str) -> Table:

@@ -64,9 +64,16 @@ def restore(
     made = agent_of(run, agent)
     found = task_of(run, task)
     spec = found.spec
+    check_interface(run, found)
     keys = jax.random.split(jax.random.key(0), len(run.seeds))
     like = jax.eval_shape(jax.vmap(lambda key: made.networks(made.init(key, spec))), keys)
     return made, found, run.load(like, best), run.precision
+
+
+def check_interface(run: Run, task: Any) -> None:
+    """Raise a UserError if a Gymnasium environment has other entries or actions than in the training of a run."""
+    if isinstance(task, GymnasiumTask):
+        task.interface.check(run.config.get("interface"), str(run.folder))
 
 
 def restore_seed(
@@ -116,7 +123,7 @@ def agent_of(run: Run, agent: Agent | type | None = None) -> Agent:
 def as_argument(run: Run) -> str:
     """A run as the argument of a command: its folder, and --agent if the run has a user's own agent."""
     name = run.config["agent"]
-    return f"{run.folder} --agent {one_line(name)}" if agents.is_own(name) else str(run.folder)
+    return f"{run.shown} --agent {one_line(name)}" if agents.is_own(name) else run.shown
 
 
 def task_of(run: Run | str | os.PathLike[str], task: Task | GymnasiumTask | type | None = None) -> Any:

@@ -170,7 +170,9 @@ class Lockstep:
             if not process.is_alive():
                 dead.append(f"{lane} (exit code {process.exitcode})")
         who = " and ".join(dead) or "one of them"
-        return f"{self.task.name} (step {self.steps}): the process of {who} has died, out of memory or killed."
+        killed = any(process.exitcode is not None and process.exitcode < 0 for process in processes)
+        why = ", killed or out of memory" if killed or not dead else ""
+        return f"{self.task.name} (step {self.steps}): the process of {who} has ended{why}."
 
 
 class _Factory:

@@ -3,6 +3,8 @@
 import base64
 import contextlib
 import io
+import os
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -23,6 +25,15 @@ def duration(seconds: float) -> str:
     minutes, seconds = divmod(int(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
+
+
+class Output(Console):
+    """A console that does not end the program if nobody reads its output any more."""
+
+    def on_broken_pipe(self) -> None:
+        """Write to nowhere from now on."""
+        self.quiet = True
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class Screen:
@@ -54,7 +65,16 @@ class Screen:
 
     def show(self, what: RenderableType) -> None:
         """Print something that stays."""
-        self.console.print(what, markup=False, highlight=False, soft_wrap=isinstance(what, str))
+        with self.unless_gone():
+            self.console.print(what, markup=False, highlight=False, soft_wrap=isinstance(what, str))
+
+    @contextlib.contextmanager
+    def unless_gone(self) -> Iterator[None]:
+        """If the output cannot be written any more, show nothing from then on. The training continues."""
+        try:
+            yield
+        except OSError:
+            self.console.quiet = True
 
     def status(self, text: str, live: RenderableType) -> None:
         """Replace the status. A log prints `text`, a live screen shows `live`."""
@@ -69,7 +89,7 @@ class Screen:
     def _break_silence(self) -> None:
         while not self._is_over.wait(max(self._printed + SILENCE - time.monotonic(), 0.1)):
             if time.monotonic() - self._printed >= SILENCE:
-                with contextlib.suppress(OSError, ValueError):  # the reader has gone; the training notices it
+                with contextlib.suppress(ValueError):  # the output was closed
                     self.line(self._status)
 
 
@@ -87,7 +107,8 @@ class Terminal(Screen):
         self._live.stop()
 
     def status(self, text: str, live: RenderableType) -> None:
-        self._live.update(live)
+        with self.unless_gone():
+            self._live.update(live)
 
 
 class Notebook(Screen):
@@ -141,7 +162,7 @@ class Notebook(Screen):
 
 def screen(patience: float = SILENCE) -> Screen:
     """The screen of this process. `patience` is as in `Screen`."""
-    console = Console()
+    console = Output()
     kind = Notebook if console.is_jupyter else Terminal if console.is_terminal else Screen
     return kind(console, patience)
 

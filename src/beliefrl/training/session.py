@@ -72,17 +72,17 @@ class Session:
             restore: `Session.restore`, to continue from a checkpoint.
             networks: the first networks of a new training, if they come from another run (`initial.taken`).
         """
+        if jax.config.jax_enable_x64:
+            raise UserError("JAX is set to 64 bits (jax_enable_x64), and a training computes in 32: switch it off.")
         keep_compiled(self._note)
         try:
             with self.recorder, jax.default_matmul_precision(self.options.precision):
                 if networks is not None:
                     initial.write(self.recorder.folder, networks)
                 self._train(restore)
-        except BrokenPipeError:  # the reader of the output has closed it
-            raise
         except OSError as error:
             raise UserError(
-                f"{self.recorder.folder} cannot be written ({cause(error)}): fix that, then "
+                f"{self.recorder.shown} cannot be written ({cause(error)}): fix that, then "
                 f"`beliefrl resume {as_argument(self.recorder)}` goes on."
             ) from None
         return self.recorder
@@ -136,6 +136,7 @@ class Session:
     def _listen(self, event: Event) -> bool:
         """Record an event; returns whether the training ends with it, before its last step."""
         self.step = event.step
+        self.requests.renew()
         self._look_for_divergence(event)
         if self.lost:
             event = log.without(event, self.lost)
@@ -223,7 +224,7 @@ class Session:
         if self._has_ended(progress):
             return False
         go_on = f"`beliefrl resume {as_argument(self.recorder)}` goes on from there"
-        go_on = f"{go_on}, in Python beliefrl.resume({str(self.recorder.folder)!r})"
+        go_on = f"{go_on}, in Python beliefrl.resume({self.recorder.shown!r})"
         if event.phase is Phase.FAULT:
             try:  # the Fault itself is raised next
                 self._save(snapshot)

@@ -10,7 +10,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import FrameType, TracebackType
 from typing import Any
 
@@ -32,6 +32,36 @@ class Stopped(KeyboardInterrupt):
     def _render_traceback_(self) -> list[str]:
         """The lines that IPython shows in place of a traceback."""
         return [f"beliefrl: {self}"]
+
+
+class Waiting:
+    """A handler for the time in which a program imports: the first signal waits, a second one ends the program.
+
+    Python would raise in the middle of an import, or in a place where the exception is lost. `Requests` looks at it.
+    """
+
+    received = False
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        if self.received:
+            os._exit(128 + number)
+        self.received = True
+
+
+@contextlib.contextmanager
+def waiting() -> Iterator[None]:
+    """A Ctrl-C in this block waits for `Requests` in it, or for the end of the block."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    handler = Waiting()
+    before = signal.signal(signal.SIGINT, handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if handler.received:
+        raise KeyboardInterrupt
 
 
 class Requests:
@@ -61,7 +91,16 @@ class Requests:
         self._fd = signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
         for number in SIGNALS:
             self._before[number] = signal.signal(number, self._handle)
+            if isinstance(self._before[number], Waiting) and self._before[number].received:
+                self.number = number
         return self
+
+    def renew(self) -> None:
+        """Take the signals again, if an environment has replaced the handlers."""
+        for number in self._before:
+            if signal.getsignal(number) != self._handle:
+                signal.signal(number, self._handle)
+                signal.set_wakeup_fd(self._theirs.fileno(), warn_on_full_buffer=False)
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is not None and issubclass(kind, Stopped):

@@ -17,7 +17,7 @@ from beliefrl.tasks import Task
 from beliefrl.tasks.given import given
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import initial
-from beliefrl.training.evaluation import agent_of, task_of
+from beliefrl.training.evaluation import agent_of, check_interface, task_of
 from beliefrl.training.schedule import Event, Options, capacity
 from beliefrl.training.session import Callback, Session
 from beliefrl.types import UserError, plain, tuples
@@ -78,6 +78,7 @@ def train(
         "hyperparameters": hyperparameters.of(agent),
         **tasks.describe(made),
         "options": dataclasses.asdict(chosen),
+        **({"interface": made.interface._asdict()} if isinstance(made, GymnasiumTask) else {}),
         **provenance(),
     }
     if resume and out is not None and os.path.exists(os.path.join(out, "config.json")):  # noqa: PTH110, PTH118 - pathlib's raises where a name is too long
@@ -156,11 +157,13 @@ def _go_on(
         made = task_of(recorder, task)
         if task is not None:
             _check_same_task(recorder, made)
+        check_interface(run, made)
         before = _options(recorder)
         steps = changes.get("steps", before["steps"])
         if steps < before["steps"]:
             raise UserError(f"steps={steps} is impossible: {folder} trains for {before['steps']}, and may only grow.")
         options = Options(**before | changes)
+        _check_higher(recorder, options)
         _ = capacity(made_by, options)  # raise before the run's config changes
         _check_possible(options, made, own_process)
         recorder.amend({"options": dataclasses.asdict(options)}, provenance())
@@ -170,6 +173,17 @@ def _go_on(
             training.begin_again()
         stack.pop_all()
         return training.run(None if begins_again else training.restore)
+
+
+def _check_higher(run: Run, options: Options) -> None:
+    """Raise a UserError if a training that has reached its `stop_at` is given a lower one."""
+    before = run.options
+    lower = before.stop_at is not None and options.stop_at is not None and options.stop_at < before.stop_at
+    if lower and run.reached(before.stop_at, before.stop_patience):
+        raise UserError(
+            f"stop_at={options.stop_at:g} is impossible: {run.shown} has reached {before.stop_at:g} already. Give a "
+            "higher return, or None."
+        )
 
 
 class _OfCallback(Exception):
@@ -218,7 +232,10 @@ def _chosen(options: dict[str, Any]) -> Options:
     source = options.get("init_from")
     path = source.folder if isinstance(source, Run) else source
     chosen: dict[str, Any] = options | {"init_from": str(path) if isinstance(path, os.PathLike) else path}
-    return Options(**chosen)
+    made = Options(**chosen)
+    if made.stop_patience != 1 and made.stop_at is None:
+        raise UserError(f"stop_patience={made.stop_patience} needs stop_at: give the return, too.")
+    return made
 
 
 def _check_possible(options: Options, task: Any, own_process: bool) -> None:
