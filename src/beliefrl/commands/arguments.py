@@ -178,8 +178,8 @@ def parse(options: Any, argv: Sequence[str], prog: str, advice: str = "") -> Any
 
 def refuse_empty(argv: Sequence[str], *options: str) -> None:
     """Raise a UsageError if one of these options is given without a value, for example an empty variable of a shell."""
-    for option, after in zip(argv, [*argv[1:], "-"], strict=True):
-        if option in options and after.startswith("-"):
+    for option, after in zip(argv, [*argv[1:], "--"], strict=True):
+        if option in options and after.startswith("--"):
             raise UsageError(f"{option} needs a value: give one, or leave the option out.")
 
 

@@ -113,7 +113,7 @@ class GymnasiumTask:
         Raises:
             UserError: the environment cannot be made.
         """
-        wide = jax.config.jax_enable_x64
+        wide = jax.config.read("jax_enable_x64")
         try:
             return self.make(**self.arguments)
         except UserError:
