@@ -120,7 +120,7 @@ class Run:
         return self.folder / "metrics" / f"seed-{seed}.jsonl"
 
     def results(self) -> Row | None:
-        """The summary of the last evaluation; None until a training has finished.
+        """The summary of the last evaluation before the training ended or was stopped; None before that.
 
         Raises:
             UserError: results.json is damaged.
@@ -268,13 +268,13 @@ class Recorder(Run):
             for tracker in of_seed:
                 tracker.flush()
 
-    def save(self, agents: Any, but: Collection[int] = ()) -> None:
-        """Save the agents of all seeds atomically; those of the seeds `but` (indices) are not changed."""
+    def save(self, agents: Any, but: Collection[int] = (), step: int | None = None) -> None:
+        """Save the agents of all seeds at a step atomically; those of the seeds `but` (indices) are not changed."""
         path, saved = self.folder / "agent.safetensors", arrays.copied(agents)
         before = arrays.load(path) if but and path.exists() else {}
         for name, kept in before.items():
             saved[name][sorted(but)] = kept[sorted(but)]
-        write_whole(path, arrays.packed(saved))
+        write_whole(path, arrays.packed(saved, None if step is None else {"step": str(step)}))
 
     def finish(self, results: Row) -> None:
         """Write the summary of the last evaluation."""

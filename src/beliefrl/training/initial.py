@@ -43,7 +43,7 @@ def taken(options: Options, agent: Agent, spec: Spec) -> tuple[dict[str, np.ndar
     first, count = source.seeds[0], len(source.seeds)
     seeds = range(options.seed, options.seed + options.seeds)
     index = [(seed - first) % count for seed in seeds]
-    ends = best.evaluations(source.folder, count) if options.init_best else _last_evaluations(source)
+    ends = best.evaluations(source.folder, count) if options.init_best else _last_steps(source)
     session = [source.config, *source.config.get("resumed", ())][-1]
     origin = {
         "run": str(source.folder),
@@ -74,9 +74,17 @@ def started(folder: pathlib.Path, agent: Agent, states: Any) -> Any:
     )
 
 
-def _last_evaluations(source: Run) -> list[dict[str, Any] | None]:
-    """{"step"} of the last evaluation of each seed."""
-    steps = [max((row["step"] for row in source.rows(seed, "evaluation")), default=None) for seed in source.seeds]
+def _last_steps(source: Run) -> list[dict[str, Any] | None]:
+    """{"step"} at which each seed was saved. A seed that has diverged, or a file without its step: the last evaluation.
+
+    At an error of an environment, agents are saved without an evaluation.
+    """
+    saved = arrays.about(source.agents()).get("step", "")
+    steps = []
+    for seed in source.seeds:
+        evaluated = max((row["step"] for row in source.rows(seed, "evaluation")), default=None)
+        diverged = any(source.rows(seed, "diverged"))
+        steps.append(int(saved) if saved.isdecimal() and not diverged else evaluated)
     return [None if step is None else {"step": step} for step in steps]
 
 

@@ -63,7 +63,7 @@ def record(recorder: Recorder, event: Event, lost: Collection[int]) -> dict[str,
             recorder.log(seed, "evaluation", event.step, _evaluated(result))
     if event.states is not None:
         recorder.flush()
-        recorder.save(event.states, lost)
+        recorder.save(event.states, lost, event.step)
     if event.evaluation is None:
         return None
     if event.states is not None:
