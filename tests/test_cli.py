@@ -14,12 +14,12 @@ import tyro
 
 from beliefrl import cli
 from beliefrl.commands import COMMANDS
-from beliefrl.commands.arguments import UsageError, parse
+from beliefrl.commands.arguments import parse
 from beliefrl.commands.pictures import DemoOptions, FilmOptions, PredictOptions
+from beliefrl.errors import UserError
 from beliefrl.runs.run import Run
 from beliefrl.sweeps.plan import grid, plan
 from beliefrl.sweeps.run import sweep
-from beliefrl.types import UserError
 from mistakes import MISTAKES, TRAIN, prepare
 from worlds import installed
 
@@ -157,14 +157,14 @@ def test_whole_numbers_may_be_written_short(text, number):
 @pytest.mark.parametrize("text", ["1.5", "many", "inf", "nan", "1e-3", "1e999999", "20k"])
 def test_what_is_no_whole_number_is_a_mistake(text):
     for option in ("steps", "most"):
-        with pytest.raises(UsageError, match=f"^--{option} must be a whole number, not '{text}'"):
+        with pytest.raises(UserError, match=f"^--{option} must be a whole number, not '{text}'"):
             read(f"--{option} {text}")
 
 
 def test_options_may_be_none_and_lists_may_be_empty():
     assert read("--most None --preset None --layers") == Given(most=None, layers=())
     assert read("x y --preset b") == Given(files=("x", "y"), preset="b")
-    with pytest.raises(UsageError, match="--preset must be one of 'a', 'b', 'None', not 'c'"):
+    with pytest.raises(UserError, match="--preset must be one of 'a', 'b', 'None', not 'c'"):
         read("--preset c")
 
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from beliefrl.commands import COMMANDS, find
-from beliefrl.errors import UsageError, UserError, one_line
+from beliefrl.errors import UserError, one_line
 
 HELP = """usage: beliefrl COMMAND ...
 
@@ -75,7 +75,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         sys.path.insert(0, "")  # as `python -m` does: finds my_module:MyAgent and gym:my_module:MyEnv-v0 here
     try:
         find(argv[0])(argv[1:])
-    except (UsageError, UserError) as error:
+    except UserError as error:
         _fail(one_line(str(error)))
     except KeyboardInterrupt as stopped:
         what = str(stopped) or "stopped; what was logged and saved until now is kept."

@@ -10,10 +10,6 @@ class UserError(Exception):
     """A mistake that the user can fix. Its message is one sentence: what was wrong, and what to do."""
 
 
-class UsageError(Exception):
-    """A mistake on the command line; the message is one sentence."""
-
-
 def cause(error: OSError) -> str:
     """The operating system's reason for an error, or else the error's own text."""
     return error.strerror or one_line(str(error))

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Union, get_args
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from beliefrl.errors import UsageError as UsageError
+from beliefrl.errors import UserError
 
 VALUES = ConstructorRegistry()
 
@@ -140,7 +140,7 @@ def agent_options(agent: Any, own: dict[str, Any]) -> type:
     taken = set(_option_names(dataclasses.make_dataclass("Options", fields)))
     for field in dataclasses.fields(agent):
         if field.name in taken:
-            raise UsageError(f"{type(agent).__name__} has a field {field.name}, an option of this command: rename it.")
+            raise UserError(f"{type(agent).__name__} has a field {field.name}, an option of this command: rename it.")
     fields.append(("agent", hyperparameters, dataclasses.field(default=agent)))
     return dataclasses.make_dataclass("Options", fields, frozen=True)
 
@@ -154,12 +154,12 @@ def agent_name(argv: Sequence[str], command: str, more: str = "") -> tuple[str, 
         print("MODULE:CLASS is an agent of your own, in the current folder or on the Python path.")
         raise SystemExit(0)
     if not argv or argv[0].startswith("-"):
-        raise UsageError(f"No agent is given: write {usage}; `beliefrl agents` lists the agents.")
+        raise UserError(f"No agent is given: write {usage}; `beliefrl agents` lists the agents.")
     return argv[0], argv[1:]
 
 
 def parse(options: Any, argv: Sequence[str], prog: str, advice: str = "") -> Any:
-    """Parse the options. A mistake raises a UsageError with one sentence, instead of tyro's box.
+    """Parse the options. A mistake raises a UserError with one sentence, instead of tyro's box.
 
     `advice` is the end of the message for an option that does not exist and resembles no other.
     """
@@ -170,17 +170,17 @@ def parse(options: Any, argv: Sequence[str], prog: str, advice: str = "") -> Any
         with contextlib.redirect_stderr(box), contextlib.redirect_stdout(box):
             parsed, unknown = tyro.cli(options, prog=prog, args=argv, return_unknown_args=True, registry=VALUES)
     except SystemExit:
-        raise UsageError(f"{_sentence(box.getvalue())}; `{prog} --help` shows the options.") from None
+        raise UserError(f"{_sentence(box.getvalue())}; `{prog} --help` shows the options.") from None
     if unknown:
-        raise UsageError(_unknown(options, unknown[0], prog, advice))
+        raise UserError(_unknown(options, unknown[0], prog, advice))
     return parsed
 
 
 def refuse_empty(argv: Sequence[str], *options: str) -> None:
-    """Raise a UsageError if one of these options is given without a value, for example an empty variable of a shell."""
+    """Raise a UserError if one of these options is given without a value, for example an empty variable of a shell."""
     for option, after in zip(argv, [*argv[1:], "--"], strict=True):
         if option in options and after.startswith("--"):
-            raise UsageError(f"{option} needs a value: give one, or leave the option out.")
+            raise UserError(f"{option} needs a value: give one, or leave the option out.")
 
 
 def named_values(given: Sequence[str], option: str) -> dict[str, Any]:
@@ -189,11 +189,11 @@ def named_values(given: Sequence[str], option: str) -> dict[str, Any]:
     for each in given:
         name, separator, value = each.partition("=")
         if not (separator and name.isidentifier()):
-            raise UsageError(f"{option} {each} cannot be understood: write NAME=VALUE, such as max_episode_steps=500.")
+            raise UserError(f"{option} {each} cannot be understood: write NAME=VALUE, such as max_episode_steps=500.")
         if name in values:
-            raise UsageError(f"{option} has {name} twice: give it once.")
+            raise UserError(f"{option} has {name} twice: give it once.")
         if name in ("name", "observe", "faults"):  # arguments of `tasks.make` that are not constants
-            raise UsageError(
+            raise UserError(
                 f"{option} {each} is impossible: name, observe and faults are not constants of a task: use TASK, "
                 "--observe, and options such as --noise."
             )

@@ -8,7 +8,8 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from beliefrl.commands.arguments import Out, UsageError, parse
+from beliefrl.commands.arguments import Out, parse
+from beliefrl.errors import UserError
 
 KINDS = ("curves", "run", "ablation", "sensitivity", "elbo", "aggregate", "scalability", "table")
 TABLES = ("scalability", "table")
@@ -60,7 +61,7 @@ def figure(argv: Sequence[str]) -> None:
         return
     if not argv or argv[0] not in KINDS:
         given = f"There is no figure {argv[0]!r}" if argv else "No figure is given"
-        raise UsageError(f"{given}: write beliefrl figure KIND RUNS, where KIND is {', '.join(KINDS)}.")
+        raise UserError(f"{given}: write beliefrl figure KIND RUNS, where KIND is {', '.join(KINDS)}.")
     kind = argv[0]
     options = parse(FigureOptions, argv[1:], f"beliefrl figure {kind}")
     runs, notes = _runs(options, kind)
@@ -80,7 +81,6 @@ def _draw(kind: str, runs: Sequence[Any], out: pathlib.Path, actions: str) -> tu
     from beliefrl.analysis.figures import curve_figure, save
     from beliefrl.analysis.groups import groups, left_out
     from beliefrl.sweeps import sources
-    from beliefrl.types import UserError
 
     if kind == "run":
         if len(runs) > 1:
@@ -104,10 +104,9 @@ def _draw(kind: str, runs: Sequence[Any], out: pathlib.Path, actions: str) -> tu
 def _runs(options: FigureOptions, kind: str) -> tuple[list[Any], list[str]]:
     """The selected runs, and one sentence for each damaged file and each run that is left out."""
     from beliefrl.analysis import groups, results
-    from beliefrl.types import UserError
 
     if not options.runs:
-        raise UsageError("RUNS is missing: give runs, folders that contain runs, or files of results.")
+        raise UserError("RUNS is missing: give runs, folders that contain runs, or files of results.")
     found = groups.find(options.runs)
     chosen = [run for run in found.runs if _is_chosen(run, options, kind)]
     drawn = [run for run in chosen if options.unfinished or groups.is_finished(run)]
@@ -151,7 +150,7 @@ def report(argv: Sequence[str]) -> None:
     """`beliefrl report RUNS -o report.html`."""
     options = parse(ReportOptions, argv, "beliefrl report")
     if not options.runs:
-        raise UsageError("RUNS is missing: give runs, folders that contain runs, or files of results.")
+        raise UserError("RUNS is missing: give runs, folders that contain runs, or files of results.")
     from beliefrl.report import write_report
 
     path = write_report(options.runs, options.out, options.unfinished, lambda sentence: print(f"damaged: {sentence}"))

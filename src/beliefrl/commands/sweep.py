@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from beliefrl.commands.arguments import UsageError, named_values, parse, value_lists
+from beliefrl.commands.arguments import named_values, parse, value_lists
+from beliefrl.errors import UserError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +85,7 @@ def _experiments(options: SweepOptions) -> list:
     Options(seed=first, seeds=count or 1)
     if options.file is not None:
         if options.preset or options.agents or options.tasks:
-            raise UsageError("FILE defines the agents and tasks: leave --preset, --agents and --tasks out.")
+            raise UserError("FILE defines the agents and tasks: leave --preset, --agents and --tasks out.")
         chosen = sources.load(options.file)
         if count is not None:
             chosen = [dataclasses.replace(each, seeds=tuple(range(first, first + count))) for each in chosen]
@@ -98,7 +99,7 @@ def _experiments(options: SweepOptions) -> list:
     elif options.out is not None and _only_continues(options) and sources.read(options.out):
         return []
     else:
-        raise UsageError(
+        raise UserError(
             "There is nothing to run: give --preset, or --agents and --tasks, or FILE, or the --out of a sweep."
         )
     chosen = _with_settings(chosen, options)

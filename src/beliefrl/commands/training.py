@@ -17,6 +17,7 @@ from beliefrl.commands.arguments import (
     parse,
     refuse_empty,
 )
+from beliefrl.errors import UserError
 from beliefrl.training.stop import waiting
 
 NewLimit = Annotated[float | Literal["same"] | None, tyro.conf.arg(metavar="FLOAT|None|same")]
@@ -75,7 +76,6 @@ def check(argv: Sequence[str]) -> None:
     from rich.console import Console
 
     from beliefrl import tasks
-    from beliefrl.errors import UserError
     from beliefrl.tasks.check import check as look
 
     task = tasks.make(options.task, **named_values(options.constants, "--constants"))

@@ -8,7 +8,8 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from beliefrl import catalogue
-from beliefrl.commands.arguments import UsageError, named_values, parse, value_lists
+from beliefrl.commands.arguments import named_values, parse, value_lists
+from beliefrl.errors import UserError
 
 SHOWN = 5  # of the best trials
 
@@ -98,7 +99,7 @@ def _settings(options: TuneOptions) -> dict[str, Any]:
     fixed = {}
     for name, values in value_lists(options.set, "--set").items():
         if len(values) > 1:
-            raise UsageError(f"--set {name} has several values: --range {name}=A,B,C tries them.")
+            raise UserError(f"--set {name} has several values: --range {name}=A,B,C tries them.")
         fixed[name] = values[0]
     return fixed if options.steps is None else fixed | {"steps": options.steps}
 
