@@ -90,7 +90,13 @@ def tuples(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def plain(value: Any) -> Any:
     """The value as JSON has it: tuples are lists, NumPy's numbers are numbers, and what JSON does not have is text."""
-    return json.loads(json.dumps(value, default=lambda each: each.tolist() if hasattr(each, "tolist") else str(each)))
+
+    def simple(value: Any) -> Any:
+        if isinstance(value, np.floating):
+            return float(value)
+        return value.tolist() if isinstance(value, np.ndarray | np.generic | jax.Array) else str(value)
+
+    return json.loads(json.dumps(value, default=simple))
 
 
 def as_array(value: Any) -> np.ndarray:

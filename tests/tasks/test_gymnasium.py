@@ -6,6 +6,7 @@ import pathlib
 
 import gymnasium
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -16,7 +17,7 @@ from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
 from beliefrl.tasks.interface import Interface
 from beliefrl.training.lockstep import Lockstep
 from beliefrl.types import UserError
-from wrong import BOX, FAULTS, UNSUPPORTED, Dictionary, Fine, spaced
+from wrong import BOX, FAULTS, UNSUPPORTED, Dictionary, Fine, observing, spaced
 
 
 def a_sentence(error):
@@ -76,6 +77,31 @@ def test_the_interface_has_the_entries_that_the_agent_sees_and_the_bounds_of_its
     assert GymnasiumTask(Fine).interface.entries == ("entry 0", "entry 1")
 
 
+def test_discrete_values_of_any_type_of_number_are_observed():
+    for space, given, expected in (
+        (spaces.Discrete(2), np.bool_(True), [0, 1]),
+        (spaces.Discrete(3, start=1), np.array([3]), [0, 0, 1]),
+        (spaces.MultiDiscrete([2, 3]), jnp.array([1, 2]), [0, 1, 0, 0, 1]),
+        (spaces.MultiBinary(2), (True, False), [1, 0]),
+    ):
+        environment = GymnasiumTask(observing(space, given, given)).environment()
+        np.testing.assert_array_equal(environment.reset(seed=0)[0], expected)
+
+
+def test_an_environment_that_switches_jax_to_64_bits_needs_a_process_of_its_own():
+    class Wide(Fine):
+        def step(self, action):
+            jax.config.update("jax_enable_x64", True)
+            return super().step(action)
+
+    lanes = Lockstep(GymnasiumTask(Wide, "robot"), ["seed 0"])
+    lanes.reset(np.array([0]))
+    with pytest.raises(Fault, match="robot has switched JAX to 64 bits"):
+        lanes.step(np.zeros((1, 1), np.float32))
+    assert not jax.config.read("jax_enable_x64")
+    lanes.close()
+
+
 def test_making_an_environment_changes_neither_the_working_directory_nor_jax(tmp_path, monkeypatch):
     class Moving(Fine):
         def __init__(self):
@@ -85,7 +111,7 @@ def test_making_an_environment_changes_neither_the_working_directory_nor_jax(tmp
     monkeypatch.chdir(tmp_path)
     assert GymnasiumTask(Moving).spec.obs_dim == 2
     assert pathlib.Path.cwd() == tmp_path
-    assert not jax.config.jax_enable_x64
+    assert not jax.config.read("jax_enable_x64")
 
 
 def test_a_text_in_place_of_a_tuple_of_measures_is_an_error(unchecked):

@@ -87,7 +87,6 @@ def test_a_log_gets_a_line_where_nothing_else_was_printed_for_a_minute(run, monk
     assert said(display.screen.console.file.getvalue()) == lines
 
 
-@pytest.mark.nightly
 def test_a_training_goes_on_if_its_output_cannot_be_written():
     class Full(io.StringIO):
         def write(self, text):
@@ -99,6 +98,7 @@ def test_a_training_goes_on_if_its_output_cannot_be_written():
     assert shown.console.quiet
 
 
+@pytest.mark.nightly
 def test_a_training_from_python_shows_its_phases_and_evaluations(tmp_path, capsys):
     train(AGENT, "pendulum", tmp_path / "run", **OPTIONS)
     out = capsys.readouterr().out

@@ -20,7 +20,7 @@ from beliefrl.runs import arrays
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import phases
 from beliefrl.training.evaluation import agent_of
-from beliefrl.types import UserError, perception
+from beliefrl.types import UserError, perception, plain
 from worlds import Counter, Counting, CountingAgent
 
 OPTIONS = {"steps": 20, "eval_every": 20, "eval_episodes": 1, "checkpoint_steps": 10}
@@ -59,6 +59,12 @@ def test_a_run_that_was_given_a_number_of_numpy_is_read_and_resumed(tmp_path):
     assert run.config["hyperparameters"]["cycle"] == 2
     assert beliefrl.evaluate(run, 1, agent=CountingAgent)["episodes"] == 1
     assert beliefrl.resume(run, 30, agent=CountingAgent).results()["step"] == 30
+
+
+def test_what_is_no_number_is_recorded_as_text():
+    given = {"kind": np.float32, "few": np.arange(2), "wide": np.longdouble(0.5), "one": np.bool_(True), "path": ("a",)}
+    recorded = {"kind": "<class 'numpy.float32'>", "few": [0, 1], "wide": 0.5, "one": True, "path": ["a"]}
+    assert plain(given) == recorded
 
 
 def test_whatever_reads_a_run_takes_it(run, tmp_path):

@@ -108,7 +108,7 @@ def final_rows(groups: Sequence[Group]) -> list[tuple[str, ...]]:
                 f"{sampled.steps[-1]:,}",
                 _final(group, "sampled") + _measures(group, "sampled"),
                 _final(group, "mode") + _measures(group, "mode"),
-                _solved(group.task, sampled, mode),
+                "no" if group.diverged.all() else _solved(group.task, sampled, mode),
                 "unknown" if seconds is None else hours(seconds),
             )
         )

@@ -65,10 +65,10 @@ def about(path: pathlib.Path) -> dict[str, str]:
     try:
         with safetensors.safe_open(path, "numpy") as file:
             return file.metadata() or {}
-    except (FileNotFoundError, safetensors.SafetensorError):
+    except safetensors.SafetensorError:
         raise damaged(path) from None
     except OSError as error:
-        raise unreadable(path, error) from None
+        raise unreadable(path, error) if path.exists() else damaged(path) from None
 
 
 def misfit(path: pathlib.Path, name: str) -> UserError:
@@ -87,10 +87,10 @@ def load(path: pathlib.Path) -> dict[str, np.ndarray]:
     """
     try:
         return safetensors.numpy.load_file(path)
-    except (FileNotFoundError, safetensors.SafetensorError):
+    except safetensors.SafetensorError:
         raise damaged(path) from None
     except OSError as error:
-        raise unreadable(path, error) from None
+        raise unreadable(path, error) if path.exists() else damaged(path) from None
 
 
 def damaged(path: pathlib.Path) -> Damaged:

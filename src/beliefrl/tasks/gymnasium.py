@@ -6,7 +6,6 @@ episodes follow the same rules as those of `rollout`. This module checks everyth
 
 import contextlib
 import dataclasses
-import multiprocessing
 import os
 from collections.abc import Callable, Mapping
 from functools import cached_property
@@ -69,8 +68,10 @@ class GymnasiumTask:
 
     @cached_property
     def _seen(self) -> tuple[Spec, Interface]:
-        with contextlib.chdir(os.curdir):  # an environment may change it
+        wide = jax.config.read("jax_enable_x64")
+        with contextlib.chdir(os.curdir):  # an environment may change both
             environment = self.environment()
+        jax.config.update("jax_enable_x64", wide)
         names = observation_names(environment.inner, environment.inner_observation_space, self.name)
         actions = environment.inner_action_space
         environment.close()
@@ -113,16 +114,12 @@ class GymnasiumTask:
         Raises:
             UserError: the environment cannot be made.
         """
-        wide = jax.config.read("jax_enable_x64")
         try:
             return self.make(**self.arguments)
         except UserError:
             raise
         except Exception as error:  # an environment may raise anything
             raise UserError(f"{self.name} cannot be made: {said(error)}.") from None
-        finally:
-            if multiprocessing.parent_process() is None:  # elsewhere it may compute as it likes
-                jax.config.update("jax_enable_x64", wide)
 
 
 class Environment(gymnasium.Env[np.ndarray, np.ndarray]):

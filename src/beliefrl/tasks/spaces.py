@@ -15,7 +15,7 @@ from gymnasium import spaces
 from jaxtyping import Float, Int
 
 from beliefrl.catalogue import KNOWN, PREFIX
-from beliefrl.types import UserError, short
+from beliefrl.types import UserError, as_array, short
 
 FREE_JOINT, BALL_JOINT, SLIDE_JOINT = 0, 1, 2  # types of MuJoCo's joints; a hinge is 3
 AXES = ("x", "y", "z")
@@ -109,7 +109,13 @@ def fits(space: Any, obs: Any) -> bool:
         return all(fits(part, obs[name]) for name, part in space.items())
     if isinstance(space, spaces.Tuple):
         return all(fits(part, value) for part, value in zip(space, obs, strict=True))
-    return isinstance(space, spaces.Box) or space.contains(obs)
+    if isinstance(space, spaces.Box):
+        return True
+    value, start = as_array(obs), getattr(space, "start", 0)
+    sizes = getattr(space, "nvec", getattr(space, "n", None)) if not isinstance(space, spaces.MultiBinary) else 2
+    if value.dtype.kind not in "biuf" or sizes is None:
+        return False
+    return bool(np.all((value >= start) & (value < start + sizes) & (value == np.floor(value))))
 
 
 def limits(space: Any, indices: Int[np.ndarray, " obs"]) -> tuple[Float[np.ndarray, " obs"], Float[np.ndarray, " obs"]]:

@@ -72,6 +72,7 @@ class Lockstep:
         """
         self.task, self.lanes, self.timeout = task, lanes, timeout
         self.steps = 0
+        self._is_wide = jax.config.read("jax_enable_x64")
         self._envs: Any = None
         self._call: _Call | None = None  # the call of the environments that has not returned
         self._closed = threading.Event()
@@ -141,6 +142,12 @@ class Lockstep:
             self._call = None
             raise
         self._call = None
+        if jax.config.read("jax_enable_x64") != self._is_wide:
+            jax.config.update("jax_enable_x64", self._is_wide)
+            raise Fault(
+                f"{self.task.name} has switched JAX to {32 if self._is_wide else 64} bits, which changes the training: "
+                "give it a process of its own, --processes always."
+            )
 
     def _watch(self, notify: Callable[[str], None]) -> None:
         """Report every call that takes longer than SLOW, once."""
@@ -175,6 +182,10 @@ class Lockstep:
         return f"{self.task.name} (step {self.steps}): the process of {who} has ended{why}."
 
 
+def _go_on(number: int, frame: Any) -> None:
+    """A handler that does nothing."""
+
+
 class _Factory:
     """Makes one lane's environment, in this process or a worker."""
 
@@ -184,7 +195,7 @@ class _Factory:
     def __call__(self) -> Environment:
         if multiprocessing.parent_process() is not None:
             for number in SIGNALS:  # of a whole group of processes; the training saves, and then ends the workers
-                signal.signal(number, signal.SIG_IGN)
+                signal.signal(number, _go_on)  # not SIG_IGN, which a program that the environment starts would inherit
         return self.task.environment(self.lane)
 
 
@@ -207,6 +218,7 @@ def _pays(task: GymnasiumTask, lanes: int) -> bool:
 
 def step_seconds(task: GymnasiumTask) -> float:
     """The median time of 20 steps with random actions; 0 if it cannot be measured."""
+    wide = jax.config.read("jax_enable_x64")
     try:
         environment = task.environment()
         environment.reset(seed=0)
@@ -221,6 +233,8 @@ def step_seconds(task: GymnasiumTask) -> float:
         environment.close()
     except UserError:
         return 0.0
+    finally:
+        jax.config.update("jax_enable_x64", wide)  # an environment may change it
     return float(np.median(times))
 
 

@@ -72,8 +72,6 @@ class Session:
             restore: `Session.restore`, to continue from a checkpoint.
             networks: the first networks of a new training, if they come from another run (`initial.taken`).
         """
-        if jax.config.read("jax_enable_x64"):
-            raise UserError("JAX is set to 64 bits (jax_enable_x64), and a training computes in 32: switch it off.")
         keep_compiled(self._note)
         try:
             with self.recorder, jax.default_matmul_precision(self.options.precision):

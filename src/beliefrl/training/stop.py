@@ -40,12 +40,13 @@ class Waiting:
     Python would raise in the middle of an import, or in a place where the exception is lost. `Requests` looks at it.
     """
 
-    received = False
+    received: float | None = None  # when
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        if self.received:
+        if self.received is None:
+            self.received = time.monotonic()
+        elif time.monotonic() - self.received > ONE_REQUEST:
             os._exit(128 + number)
-        self.received = True
 
 
 @contextlib.contextmanager
@@ -60,7 +61,7 @@ def waiting() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
-    if handler.received:
+    if handler.received is not None:
         raise KeyboardInterrupt
 
 
@@ -87,12 +88,15 @@ class Requests:
         self._ours, theirs = socket.socketpair()
         theirs.setblocking(False)
         self._theirs = theirs
-        threading.Thread(target=self._watch, args=(self._ours,), daemon=True).start()
+        waited, first = signal.getsignal(signal.SIGINT), None
+        if isinstance(waited, Waiting) and waited.received is not None:
+            first, waited.received = waited.received, None
+            self.number, self._heard = signal.SIGINT, first
+            self._confirm()
+        threading.Thread(target=self._watch, args=(self._ours, first), daemon=True).start()
         self._fd = signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
         for number in SIGNALS:
             self._before[number] = signal.signal(number, self._handle)
-            if isinstance(self._before[number], Waiting) and self._before[number].received:
-                self.number = number
         return self
 
     def renew(self) -> None:
@@ -119,8 +123,7 @@ class Requests:
         elif is_interactive() and time.monotonic() - self._heard > ONE_REQUEST:
             raise Stopped("stopped at once; what was logged and saved stays in the run's folder.", number)
 
-    def _watch(self, ours: socket.socket) -> None:
-        first = None
+    def _watch(self, ours: socket.socket, first: float | None) -> None:
         with ours:
             while received := ours.recv(1):
                 if received[0] in SIGNALS:

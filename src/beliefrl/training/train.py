@@ -163,6 +163,9 @@ def _go_on(
         if steps < before["steps"]:
             raise UserError(f"steps={steps} is impossible: {folder} trains for {before['steps']}, and may only grow.")
         options = Options(**before | changes)
+        if options.stop_at is None and "stop_patience" not in changes:
+            options = dataclasses.replace(options, stop_patience=1)
+        _check_patience(options)
         _check_higher(recorder, options)
         _ = capacity(made_by, options)  # raise before the run's config changes
         _check_possible(options, made, own_process)
@@ -230,12 +233,16 @@ def _chosen(options: dict[str, Any]) -> Options:
                 "observe to make_task."
             )
     source = options.get("init_from")
-    path = source.folder if isinstance(source, Run) else source
+    path = source.shown if isinstance(source, Run) else source
     chosen: dict[str, Any] = options | {"init_from": str(path) if isinstance(path, os.PathLike) else path}
     made = Options(**chosen)
-    if made.stop_patience != 1 and made.stop_at is None:
-        raise UserError(f"stop_patience={made.stop_patience} needs stop_at: give the return, too.")
+    _check_patience(made)
     return made
+
+
+def _check_patience(options: Options) -> None:
+    if options.stop_patience != 1 and options.stop_at is None:
+        raise UserError(f"stop_patience={options.stop_patience} needs stop_at: give the return, too.")
 
 
 def _check_possible(options: Options, task: Any, own_process: bool) -> None:
