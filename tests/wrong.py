@@ -1,6 +1,7 @@
 """Faulty environments, one for each kind of fault."""
 
 import os
+import pathlib
 import signal
 import sys
 import time
@@ -216,3 +217,19 @@ class Stuck(Fine):
         if self.time == 2 and self.action > 0:
             time.sleep(60)
         return super().step(action)
+
+
+class Closing(Fine):
+    """Writes a file when it is closed after a step. Its third step fails if the action is positive."""
+
+    def __init__(self, folder):
+        self.folder = pathlib.Path(folder)
+
+    def step(self, action):
+        if self.time == 2 and action > 2:
+            raise ValueError("out of range")
+        return super().step(action)
+
+    def close(self):
+        if getattr(self, "time", 0):
+            (self.folder / f"closed-{os.getpid()}-{id(self)}").touch()

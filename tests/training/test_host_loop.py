@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-import pathlib
 import re
 import signal
 import sys
@@ -23,7 +22,7 @@ from beliefrl.training import host_loop, initial, lockstep, phases, session
 from beliefrl.training.lockstep import Lockstep
 from beliefrl.types import UserError
 from worlds import MODELS, SEQUENCES, SHARED, Counting, CountingAgent, leaves, trained
-from wrong import Fine, Killed, Raising
+from wrong import Closing, Fine, Killed, Raising
 
 SMALL = {"vrm": MODELS | SEQUENCES, "sac-mlp": {"batch_size": 8, "pretrain_updates": 10, "standardise": True}}
 
@@ -163,22 +162,6 @@ def test_a_fault_in_a_process_of_its_own_is_reported_too(make, phrase):
             lanes.step(np.zeros((2, 1), np.float32))
     lanes.close()
     assert re.match(phrase, str(error.value))
-
-
-class Closing(Fine):
-    """Writes a file when it is closed after a step. Its third step fails if the action is positive."""
-
-    def __init__(self, folder):
-        self.folder = pathlib.Path(folder)
-
-    def step(self, action):
-        if self.time == 2 and action > 2:
-            raise ValueError("out of range")
-        return super().step(action)
-
-    def close(self):
-        if getattr(self, "time", 0):
-            (self.folder / f"closed-{os.getpid()}-{id(self)}").touch()
 
 
 @pytest.mark.parametrize("processes", ["never", "always"])

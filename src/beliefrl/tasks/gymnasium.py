@@ -54,10 +54,10 @@ class GymnasiumTask:
 
     def __post_init__(self) -> None:
         """Set the default name. Raise a UserError for an impossible time limit, or if `make` makes no environments."""
-        if isinstance(self.measures, str):
-            raise UserError(f"measures={self.measures!r} is a text: give a tuple, ({self.measures!r},).")
         if not callable(self.make):
             raise UserError(f"GymnasiumTask needs a class or function that makes environments, not {short(self.make)}.")
+        if isinstance(self.measures, str):
+            raise UserError(f"measures={self.measures!r} is a text: give a tuple, ({self.measures!r},).")
         if self.max_steps is not None:
             check_range(self, ("max_steps",), 1)
         if not self.name:
