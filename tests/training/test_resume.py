@@ -393,9 +393,15 @@ def test_a_training_ends_where_every_seed_has_reached_the_line(whole, tmp_path):
     resume(folder, callback=lambda event: notes.append(event.note))
     assert notes[-1].startswith(f"this training is finished: it {reached}; `beliefrl resume {folder} --stop-at NUMBER`")
     assert files(folder) == before
-    main(["resume", str(folder), "--stop-at", "None", "--stop-patience", "2"])
+    for changes, phrase in (
+        ({"stop_at": min(first) - 1}, "has reached"),
+        ({"stop_at": None, "stop_patience": 2}, "needs"),
+    ):
+        with pytest.raises(UserError, match=phrase):
+            resume(folder, **changes)
+    main(["resume", str(folder), "--stop-at", "None"])
     assert files(folder) == files(whole[0])
-    assert (Run(folder).options.stop_at, Run(folder).options.stop_patience) == (None, 2)
+    assert (Run(folder).options.stop_at, Run(folder).options.stop_patience) == (None, 1)
 
 
 def test_trainings_in_other_threads_leave_signals_alone(tmp_path):
