@@ -13,6 +13,7 @@ from beliefrl.training.log import without
 from beliefrl.training.rollout import Episode
 from beliefrl.training.schedule import Event, Phase
 from beliefrl.types import UserError
+from training.test_rollout import Alternating
 from worlds import MODELS, SEQUENCES, SHARED, Counting, CountingAgent, leaves, trained
 
 SMALL = {
@@ -152,14 +153,6 @@ def test_steps_are_counted_as_environment_steps():
     assert int(seeds.replay.added[0]) == 50 + 50 // 7  # every end of an episode is one timestep more
     assert int(stretch.episodes.done.sum()) == 50 // 7
     assert int(seeds.actor.length[0]) == 50 % 7
-
-
-class Alternating(Counting):
-    """Pays the action, by turns added and subtracted."""
-
-    def step(self, state, action, key):
-        state, obs, _, terminated = super().step(state, action, key)
-        return state, obs, jnp.where(state % 2 == 0, action[0], -action[0]), terminated
 
 
 def test_evaluation_has_the_returns_of_sampled_actions_and_of_mode_actions():

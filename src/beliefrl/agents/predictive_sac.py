@@ -4,13 +4,11 @@ The belief is s_t = [h_t, x_t], with the LSTM's state h_t and x_t = (o_t, a_{t-1
 running statistics. The LSTM also reads a memory of the unusual rewards of the episode. It learns during the whole
 training, and only by predicting the next observation and reward (`models.predictive_model`). The controller
 (`models.double_q`) learns on the belief. Its gradient does not reach the LSTM.
-
 This agent is not from the paper. It keeps the paper's idea: a recurrent model that learns by prediction forms the
 belief, and a soft actor-critic acts on it. It has one model without latent variables where `vrm` has two with them.
 
 The model reads the replay in order (`training.replay.Readers`): a reader's window begins with the state at the end of
-its last one. So in training a belief knows the episode since its beginning, or since the reader's last jump. After a
-jump the state is empty: the first window only fills it, until an episode begins.
+its last one. So a belief knows the episode since its beginning, or since the reader's last jump, with an empty state.
 
 The beliefs of the windows of a cycle become transitions. A pool has those of the last `pool` cycles with their targets,
 and the controller's batches are drawn from it: the windows of one cycle are too few and too correlated.

@@ -60,9 +60,8 @@ def scores(groups: Sequence[Group], mode: str = "sampled") -> dict[str, Scores]:
     Raises:
         UserError: there is no task that all labels have, or no group has an evaluation of all its seeds.
     """
-    groups = [group for group in groups if group.diverged.all() or group.curve(mode).steps.size] or with_curve(
-        groups, mode
-    )
+    usable = [group for group in groups if group.diverged.all() or group.curve(mode).steps.size]
+    groups = usable or with_curve(groups, mode)  # raises an error if there is none
     labels = list(dict.fromkeys(group.label for group in groups))
     tasks = [task for task in tasks_of(groups) if {g.label for g in groups if g.task == task} == set(labels)]
     if not tasks:

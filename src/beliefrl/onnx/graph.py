@@ -7,7 +7,7 @@ numbers. Every other primitive becomes nodes of the graph. A `scan` is unrolled.
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -261,15 +261,15 @@ class _Graph:
     def do_dot_general(self, inputs, avals, out, parameters):
         """The product as a product of matrices: the other axes of each factor become one."""
         contracted, batched = parameters["dimension_numbers"]
-        factors, free = [], []
+        factors = []
         for side, value in enumerate(inputs):
             axes, shared, shape = contracted[side], batched[side], avals[side].shape
             rest = [axis for axis in range(len(shape)) if axis not in (*axes, *shared)]
             order = [*shared, *(axes if side else rest), *(rest if side else axes)]
             turned = self.node("Transpose", value, perm=list(map(int, order)))
-            sizes = [_product(shape[axis] for axis in part) for part in ((axes, rest) if side else (rest, axes))]
+            product = math.prod(shape[axis] for axis in axes)
+            sizes = [product, -1] if side else [-1, product]  # -1 is implied by the others
             factors.append(self.node("Reshape", turned, self.shape([*(shape[axis] for axis in shared), *sizes])))
-            free.append(rest)
         return self.node("Reshape", self.node("MatMul", *factors), self.shape(out.shape))
 
 
@@ -291,13 +291,6 @@ def _like(aval: Any, number: int | float) -> Value:
 
 def _integers(*numbers: Any) -> Value:
     return lambda: np.array(numbers, np.int64)
-
-
-def _product(dimensions: Iterable[Any]) -> Any:
-    """The size of several axes together; -1, which the other sizes imply, if there are others beside the batch."""
-    dimensions = [size for size in dimensions if not (_is_fixed(size) and size == 1)]
-    mixed = len(dimensions) > 1 and not all(map(_is_fixed, dimensions))
-    return -1 if mixed else math.prod(dimensions)
 
 
 def _is_fixed(dimension: Any) -> bool:

@@ -18,8 +18,8 @@ from gymnasium import spaces
 
 from beliefrl.catalogue import our_task_names
 from beliefrl.tasks.faults import NONE, STREAM, Draws, Faults
-from beliefrl.tasks.interface import Interface
-from beliefrl.tasks.spaces import check_actions, fits, flat_bounds, flat_size, limits, observation_names
+from beliefrl.tasks.interface import Interface, interface_of, measure_of
+from beliefrl.tasks.spaces import check_actions, fits, flat_bounds, flat_size, limits
 from beliefrl.types import LARGEST, Spec, UserError, as_array, check_indices, check_range, said, short
 
 ENDLESS = 10_000  # steps after which an episode without a time limit is considered endless
@@ -72,13 +72,10 @@ class GymnasiumTask:
         with contextlib.chdir(os.curdir):  # an environment may change both
             environment = self.environment()
         jax.config.update("jax_enable_x64", wide)
-        names = observation_names(environment.inner, environment.inner_observation_space, self.name)
-        actions = environment.inner_action_space
+        interface = interface_of(environment, self.name)
         environment.close()
-        seen = tuple(names[index] for index in environment.indices)
         size = self.faults.observed_size(environment.indices.size)
-        spec = Spec(size, actions.low.size, environment.limit or LARGEST, self.measures)
-        return spec, Interface(seen, actions.low.ravel().tolist(), actions.high.ravel().tolist())
+        return Spec(size, len(interface.low), environment.limit or LARGEST, self.measures), interface
 
     @property
     def spec(self) -> Spec:
@@ -301,14 +298,3 @@ class FaultyEnvironment(Environment):
     def _draws(self) -> Draws:
         size, normal, uniform = self.indices.size, self._random.standard_normal, self._random.random
         return Draws(normal(size, np.float32), uniform(size, np.float32), uniform(), uniform())
-
-
-def measure_of(info: Any, name: str) -> float | None:
-    """A number in the info of a step, or None. Success may be called `is_success`."""
-    found = info if isinstance(info, dict) else {}
-    value: Any = found.get("is_success", found.get("success")) if name == "success" else found.get(name)
-    try:
-        number = float(np.max(value))
-    except (TypeError, ValueError):
-        return None
-    return number if np.isfinite(number) else None

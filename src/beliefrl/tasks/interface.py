@@ -1,8 +1,14 @@
-"""What a trained agent depends on in a Gymnasium environment. A run records it, and is not opened with another one."""
+"""What a training reads from a Gymnasium environment: the interface that its agent depends on, and measures.
+
+A run records the interface, and is not opened with another one.
+"""
 
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from beliefrl.errors import UserError, short
+from beliefrl.tasks.spaces import observation_names
 
 UNNAMED = "entry "
 
@@ -31,3 +37,22 @@ class Interface(NamedTuple):
                     f"{folder} was trained in another environment: {what} before: {short(old)}, now: "
                     f"{short(new)}. Give the environment of the training, or train again."
                 )
+
+
+def interface_of(environment: Any, task: str) -> Interface:
+    """The interface of an `Environment`; `task` is the name of its task."""
+    names = observation_names(environment.inner, environment.inner_observation_space, task)
+    actions = environment.inner_action_space
+    seen = tuple(names[index] for index in environment.indices)
+    return Interface(seen, actions.low.ravel().tolist(), actions.high.ravel().tolist())
+
+
+def measure_of(info: Any, name: str) -> float | None:
+    """A number in the info of a step, or None. Success may be called `is_success`."""
+    found = info if isinstance(info, dict) else {}
+    value: Any = found.get("is_success", found.get("success")) if name == "success" else found.get(name)
+    try:
+        number = float(np.max(value))
+    except (TypeError, ValueError):
+        return None
+    return number if np.isfinite(number) else None

@@ -8,7 +8,6 @@ from typing import Any, Literal
 
 from beliefrl import agents, tasks
 from beliefrl.agents import Agent, hyperparameters
-from beliefrl.runs import trackers
 from beliefrl.runs.checkpoint import listed, was_ever_written
 from beliefrl.runs.folder import free_folder
 from beliefrl.runs.records import provenance
@@ -16,13 +15,11 @@ from beliefrl.runs.run import Recorder, Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.given import given
 from beliefrl.tasks.gymnasium import GymnasiumTask
-from beliefrl.training import initial
+from beliefrl.training import checks, initial
 from beliefrl.training.evaluation import agent_of, check_interface, task_of
 from beliefrl.training.schedule import Event, Options, capacity
 from beliefrl.training.session import Callback, Session
-from beliefrl.types import UserError, plain, tuples
-
-CHANGEABLE = ("steps", "stop_at", "stop_patience", "step_timeout")  # options that may differ when a training continues
+from beliefrl.types import UserError, tuples
 
 
 def train(
@@ -72,7 +69,7 @@ def train(
     made: Any = given(task)
     chosen = _chosen(options)
     _ = capacity(agent, chosen), made.spec  # raise before the folder is made
-    _check_possible(chosen, made, own_process)
+    checks.possible(chosen, made, own_process)
     config = {
         "agent": agents.name_of(agent),
         "hyperparameters": hyperparameters.of(agent),
@@ -83,8 +80,8 @@ def train(
     }
     if resume and out is not None and os.path.exists(os.path.join(out, "config.json")):  # noqa: PTH110, PTH118 - pathlib's raises where a name is too long
         run, own = Run(out), agent if agents.is_own(config["agent"]) else None
-        _check_same(run, config, hyperparameters.values_before(agent))
-        changes = {name: getattr(chosen, name) for name in CHANGEABLE}
+        checks.same(run, config, hyperparameters.values_before(agent))
+        changes = {name: getattr(chosen, name) for name in checks.CHANGEABLE}
         return _go_on(run, changes, made, (report, callback), own, own_process, progress)
     networks = None
     if chosen.init_from is not None:
@@ -156,7 +153,7 @@ def _go_on(
         recorder = stack.enter_context(Recorder(folder, None))
         made = task_of(recorder, task)
         if task is not None:
-            _check_same_task(recorder, made)
+            checks.same_task(recorder, made)
         check_interface(run, made)
         before = _options(recorder)
         steps = changes.get("steps", before["steps"])
@@ -165,10 +162,10 @@ def _go_on(
         options = Options(**before | changes)
         if options.stop_at is None and "stop_patience" not in changes:
             options = dataclasses.replace(options, stop_patience=1)
-        _check_patience(options)
-        _check_higher(recorder, options)
+        checks.patience(options)
+        checks.higher(recorder, options)
         _ = capacity(made_by, options)  # raise before the run's config changes
-        _check_possible(options, made, own_process)
+        checks.possible(options, made, own_process)
         recorder.amend({"options": dataclasses.asdict(options)}, provenance())
         listen = showing.enter_context(_reporting(recorder, *listeners, progress))
         training = Session(recorder, made_by, made, options, listen, own_process)
@@ -176,17 +173,6 @@ def _go_on(
             training.begin_again()
         stack.pop_all()
         return training.run(None if begins_again else training.restore)
-
-
-def _check_higher(run: Run, options: Options) -> None:
-    """Raise a UserError if a training that has reached its `stop_at` is given a lower one."""
-    before = run.options
-    lower = before.stop_at is not None and options.stop_at is not None and options.stop_at < before.stop_at
-    if lower and run.reached(before.stop_at, before.stop_patience):
-        raise UserError(
-            f"stop_at={options.stop_at:g} is impossible: {run.shown} has reached {before.stop_at:g} already. Give a "
-            "higher return, or None."
-        )
 
 
 class _OfCallback(Exception):
@@ -236,68 +222,8 @@ def _chosen(options: dict[str, Any]) -> Options:
     path = source.shown if isinstance(source, Run) else source
     chosen: dict[str, Any] = options | {"init_from": str(path) if isinstance(path, os.PathLike) else path}
     made = Options(**chosen)
-    _check_patience(made)
+    checks.patience(made)
     return made
-
-
-def _check_patience(options: Options) -> None:
-    if options.stop_patience != 1 and options.stop_at is None:
-        raise UserError(f"stop_patience={options.stop_patience} needs stop_at: give the return, too.")
-
-
-def _check_possible(options: Options, task: Any, own_process: bool) -> None:
-    """Raise a UserError if options need a package, a kind of task or processes that are not available."""
-    trackers.check(options.track)
-    if options.overlap and not isinstance(task, GymnasiumTask):
-        raise UserError(
-            "overlap needs a Gymnasium environment: a task in JAX is compiled together with the updates. Leave the "
-            "option out."
-        )
-    if options.step_timeout and isinstance(task, GymnasiumTask) and options.processes == "auto" and not own_process:
-        raise UserError(
-            "step_timeout needs a process for each environment: from Python, give own_process=True, and guard the "
-            'script\'s main code with `if __name__ == "__main__":`.'
-        )
-
-
-def _check_same(run: Run, config: dict[str, Any], older: dict[str, Any]) -> None:
-    """Raise a UserError if a run was trained with other settings than those of `config`, except CHANGEABLE options.
-
-    `older` are the values of hyperparameters that the run does not record (`hyperparameters.values_before`).
-    """
-    asked = {name: config.get(name) for name in ("agent", "task", "constants", "observe", "faults")}
-    asked |= config["options"] | _with_functions_of(run.config["hyperparameters"], config["hyperparameters"])
-    before = {"faults": None} | dataclasses.asdict(Options())  # what an older version did not record, it did not have
-    asked, before = plain([asked, before | older])  # tuples are lists in the run's config
-    there = before | run.config | run.config["options"] | run.config["hyperparameters"]
-    there |= {name: asked[name] for name in CHANGEABLE}
-    for name, value in asked.items():
-        if there.get(name, value) != value:
-            change = "choose another --out, in Python out="
-            raise UserError(f"{run.folder} was trained with {name}={there[name]}, not {value}: {change}.")
-
-
-def _check_same_task(run: Run, task: Any) -> None:
-    """Raise a UserError if a run was trained on another task, with other faults, or, in JAX, with other constants.
-
-    A class may be imported from another module, and the arguments of a Gymnasium environment may differ.
-    """
-    asked, there = ({"faults": None} | each for each in (tasks.describe(task), run.config))
-    same = ("task", "faults") if isinstance(task, GymnasiumTask) else ("task", "faults", "constants")
-    for name in same:
-        ours, theirs = (plain(each[name]) for each in (asked, there))
-        if name == "task":
-            ours, theirs = (each.rpartition(":")[2] for each in (ours, theirs))
-        if ours != theirs:
-            raise UserError(f"{run.folder} was trained with {name}={there[name]}, not {asked[name]}: give that task.")
-
-
-def _with_functions_of(there: Any, asked: Any) -> Any:
-    """The hyperparameters `asked`, with functions as they are recorded `there`: as text with an address."""
-    if isinstance(asked, dict):
-        known = there if isinstance(there, dict) else {}
-        return {name: _with_functions_of(known.get(name), value) for name, value in asked.items()}
-    return there if callable(asked) and not isinstance(asked, type) else asked
 
 
 def _options(run: Run) -> dict[str, Any]:

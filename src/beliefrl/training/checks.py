@@ -1,0 +1,85 @@
+"""Checks of `train` and `resume`, before anything is changed. Each raises a UserError."""
+
+import dataclasses
+from typing import Any
+
+from beliefrl import tasks
+from beliefrl.runs import trackers
+from beliefrl.runs.run import Run
+from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.training.schedule import Options
+from beliefrl.types import UserError, plain
+
+CHANGEABLE = ("steps", "stop_at", "stop_patience", "step_timeout")  # options that may differ when a training continues
+
+
+def patience(options: Options) -> None:
+    """Raise a UserError if `stop_patience` is given without `stop_at`."""
+    if options.stop_patience != 1 and options.stop_at is None:
+        raise UserError(f"stop_patience={options.stop_patience} needs stop_at: give the return, too.")
+
+
+def possible(options: Options, task: Any, own_process: bool) -> None:
+    """Raise a UserError if options need a package, a kind of task or processes that are not available."""
+    trackers.check(options.track)
+    if options.overlap and not isinstance(task, GymnasiumTask):
+        raise UserError(
+            "overlap needs a Gymnasium environment: a task in JAX is compiled together with the updates. Leave the "
+            "option out."
+        )
+    if options.step_timeout and isinstance(task, GymnasiumTask) and options.processes == "auto" and not own_process:
+        raise UserError(
+            "step_timeout needs a process for each environment: from Python, give own_process=True, and guard the "
+            'script\'s main code with `if __name__ == "__main__":`.'
+        )
+
+
+def same(run: Run, config: dict[str, Any], older: dict[str, Any]) -> None:
+    """Raise a UserError if a run was trained with other settings than those of `config`, except CHANGEABLE options.
+
+    `older` are the values of hyperparameters that the run does not record (`hyperparameters.values_before`).
+    """
+    asked = {name: config.get(name) for name in ("agent", "task", "constants", "observe", "faults")}
+    asked |= config["options"] | _with_functions_of(run.config["hyperparameters"], config["hyperparameters"])
+    before = {"faults": None} | dataclasses.asdict(Options())  # what an older version did not record, it did not have
+    asked, before = plain([asked, before | older])  # tuples are lists in the run's config
+    there = before | run.config | run.config["options"] | run.config["hyperparameters"]
+    there |= {name: asked[name] for name in CHANGEABLE}
+    for name, value in asked.items():
+        if there.get(name, value) != value:
+            change = "choose another --out, in Python out="
+            raise UserError(f"{run.folder} was trained with {name}={there[name]}, not {value}: {change}.")
+
+
+def same_task(run: Run, task: Any) -> None:
+    """Raise a UserError if a run was trained on another task, with other faults, or, in JAX, with other constants.
+
+    A class may be imported from another module, and the arguments of a Gymnasium environment may differ.
+    """
+    asked, there = ({"faults": None} | each for each in (tasks.describe(task), run.config))
+    same = ("task", "faults") if isinstance(task, GymnasiumTask) else ("task", "faults", "constants")
+    for name in same:
+        ours, theirs = (plain(each[name]) for each in (asked, there))
+        if name == "task":
+            ours, theirs = (each.rpartition(":")[2] for each in (ours, theirs))
+        if ours != theirs:
+            raise UserError(f"{run.folder} was trained with {name}={there[name]}, not {asked[name]}: give that task.")
+
+
+def _with_functions_of(there: Any, asked: Any) -> Any:
+    """The hyperparameters `asked`, with functions as they are recorded `there`: as text with an address."""
+    if isinstance(asked, dict):
+        known = there if isinstance(there, dict) else {}
+        return {name: _with_functions_of(known.get(name), value) for name, value in asked.items()}
+    return there if callable(asked) and not isinstance(asked, type) else asked
+
+
+def higher(run: Run, options: Options) -> None:
+    """Raise a UserError if a training that has reached its `stop_at` is given a lower one."""
+    before = run.options
+    lower = before.stop_at is not None and options.stop_at is not None and options.stop_at < before.stop_at
+    if lower and run.reached(before.stop_at, before.stop_patience):
+        raise UserError(
+            f"stop_at={options.stop_at:g} is impossible: {run.shown} has reached {before.stop_at:g} already. Give a "
+            "higher return, or None."
+        )
