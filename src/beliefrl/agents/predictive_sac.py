@@ -8,7 +8,7 @@ This agent is not from the paper. It keeps the paper's idea: a recurrent model t
 belief, and a soft actor-critic acts on it. It has one model without latent variables where `vrm` has two with them.
 
 The model reads the replay in order (`training.replay.Readers`): a reader's window begins with the state at the end of
-its last one. So a belief knows the episode since its beginning, or since the reader's last jump, with an empty state.
+its last one. So a belief knows the episode since its beginning, or since the reader's last jump, which empties it.
 
 The beliefs of the windows of a cycle become transitions. A pool has those of the last `pool` cycles with their targets,
 and the controller's batches are drawn from it: the windows of one cycle are too few and too correlated.

@@ -61,7 +61,7 @@ class Group:
         return Curve(np.array(steps), np.array([[seed.get(step, np.nan) for step in steps] for seed in table]))
 
     def final(self, name: str = "sampled") -> np.ndarray:
-        """The last values of a curve, (seed,); NaN for a seed that has diverged, and if there is no common step."""
+        """The last values of a curve, (seed,). NaN: the seed has diverged, or there is no common step."""
         curve = self.curve(name)
         last = curve.seeds[:, -1] if curve.steps.size else np.full(len(self.seeds), np.nan)
         return np.where(self.diverged, np.nan, last)

@@ -270,7 +270,7 @@ def update_statistics(
 
 
 def deviations(variance: Float[Array, " size"]) -> Float[Array, " size"]:
-    """The deviations by which entries are divided."""
+    """The numbers by which `standardise` divides: standard deviations, plus a small number."""
     return jnp.sqrt(variance) + DEVIATION_MIN
 
 

@@ -268,7 +268,7 @@ class _Graph:
             order = [*shared, *(axes if side else rest), *(rest if side else axes)]
             turned = self.node("Transpose", value, perm=list(map(int, order)))
             product = math.prod(shape[axis] for axis in axes)
-            sizes = [product, -1] if side else [-1, product]  # -1 is implied by the others
+            sizes = [product, -1] if side else [-1, product]  # -1: the rest
             factors.append(self.node("Reshape", turned, self.shape([*(shape[axis] for axis in shared), *sizes])))
         return self.node("Reshape", self.node("MatMul", *factors), self.shape(out.shape))
 

@@ -201,7 +201,7 @@ def now() -> str:
 def _git_commit() -> str | None:
     """The commit of the running code, with a + if there are uncommitted changes; None outside its git checkout.
 
-    If the package is installed inside of another project's checkout, git finds that one, which does not track it.
+    Inside of another project's checkout git finds that project, which does not track this package.
     """
     file = pathlib.Path(__file__)
     ask = partial(subprocess.run, cwd=file.parent, capture_output=True, text=True, timeout=10)

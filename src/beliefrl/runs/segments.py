@@ -72,7 +72,7 @@ def read(folder: Path, like: Any, segments: list[Segment], axes: int) -> tuple[A
     """
     shape = jax.tree.leaves(like)[0].shape[: axes + 1]
     begin = np.array(segments[0].start if segments else np.zeros(math.prod(shape[:-1]), int))
-    for before, segment in itertools.pairwise(segments):  # a gap, if another ring needs a segment from before it
+    for before, segment in itertools.pairwise(segments):  # a ring has a gap if only another one needs a file
         begin = np.where(np.array(segment.start) > np.array(before.stop), segment.start, begin)
     stop = np.array(segments[-1].stop) if segments else begin
     missing = np.where((begin > np.maximum(stop - shape[-1], 0)).any(), begin, 0)

@@ -104,7 +104,7 @@ def flat_bounds(space: Any) -> spaces.Box:
 
 
 def fits(space: Any, obs: Any) -> bool:
-    """Whether the discrete parts of an observation are in its space. `flatten` would turn others into numbers, too."""
+    """Whether the discrete parts of an observation are in its space. `flatten` does not check it."""
     if isinstance(space, spaces.Dict):
         return all(fits(part, obs[name]) for name, part in space.items())
     if isinstance(space, spaces.Tuple):

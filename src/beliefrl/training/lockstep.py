@@ -194,7 +194,7 @@ class _Factory:
 
     def __call__(self) -> Environment:
         if multiprocessing.parent_process() is not None:
-            for number in SIGNALS:  # of a whole group of processes; the training saves, and then ends the workers
+            for number in SIGNALS:  # sent to all processes of a job: the training saves, then ends these
                 signal.signal(number, _go_on)  # not SIG_IGN, which a program that the environment starts would inherit
         return self.task.environment(self.lane)
 

@@ -149,7 +149,7 @@ def _stages(
     explored = min(agent.step_start_rl, options.steps)
     stretch = stretch_length(agent, envs)
 
-    if at.evaluated // options.eval_every < at.step // options.eval_every:  # an environment failed before its end
+    if at.evaluated // options.eval_every < at.step // options.eval_every:  # a fault came before the end of this one
         yield from _evaluation(agent, program, seeds, at.step, Phase.LEARNING)
         at = at._replace(evaluated=at.step)
         yield Event(Phase.LEARNING, at.step, snapshot=Snapshot(at, seeds))

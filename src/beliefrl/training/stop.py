@@ -35,9 +35,9 @@ class Stopped(KeyboardInterrupt):
 
 
 class Waiting:
-    """A handler for the time in which a program imports: the first signal waits, a second one ends the program.
+    """A handler while a program imports modules: the first signal waits, and a second one ends the program.
 
-    Python would raise in the middle of an import, or in a place where the exception is lost. `Requests` looks at it.
+    Python's own handler raises an exception in the middle of an import, where it can be lost.
     """
 
     received: float | None = None  # when
@@ -100,7 +100,7 @@ class Requests:
         return self
 
     def renew(self) -> None:
-        """Take the signals again, if an environment has replaced the handlers."""
+        """Install the handlers again, if an environment has replaced them."""
         for number in self._before:
             if signal.getsignal(number) != self._handle:
                 signal.signal(number, self._handle)
