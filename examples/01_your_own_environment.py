@@ -6,8 +6,8 @@
 
 A registered environment needs no Python code. Here `my_robots` is a module that registers one:
 
-    beliefrl train vrm gym:my_robots:Cart-v0 --observe 0 --seeds 2
-    beliefrl train vrm gym:MountainCarContinuous-v0 --observe 0 --constants max_episode_steps=500
+    beliefrl train predictive-sac gym:my_robots:Cart-v0 --observe 0 --seeds 2
+    beliefrl train predictive-sac gym:MountainCarContinuous-v0 --observe 0 --constants max_episode_steps=500
 
 A second start continues the run in runs/cart. If that run is finished, it is not trained again.
 
@@ -48,11 +48,11 @@ def main(quick: bool = False) -> None:
     """Train without the speed. The environment never ends an episode, so this sets a time limit of 60 steps."""
     task = beliefrl.GymnasiumTask(Cart, indices=(0,), max_steps=60)
     if quick:
-        small = {"d_size": 32, "seq_len": 16, "burn_in": 16, "policy_layers": (32,), "value_layers": (32,)}
-        agent = beliefrl.make_agent("sac-lstm", step_start_rl=300, pretrain_updates=0, **small)
+        small = {"d_size": 32, "seq_len": 16, "policy_layers": (32,), "value_layers": (32,)}
+        agent = beliefrl.make_agent("predictive-sac", step_start_rl=300, pretrain_updates=100, **small)
         run = beliefrl.train(agent, task, "runs/cart-quick", resume=True, steps=600, eval_every=300)
     else:
-        run = beliefrl.train("sac-lstm", task, "runs/cart", resume=True, steps=6_000, eval_every=1_000)
+        run = beliefrl.train("predictive-sac", task, "runs/cart", resume=True, steps=6_000, eval_every=1_000)
 
     for row in run.rows(seed=0, kind="evaluation"):
         print(f"step {row['step']}: return {np.mean(row['mode']):.1f}")

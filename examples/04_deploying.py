@@ -1,7 +1,7 @@
 """Deploy a trained policy: as a function in your own loop, and as one file that jax loads without this library.
 
     pip install -c constraints.txt -e .             # in a clone of the repository
-    beliefrl train vrm gym:Pendulum-v1 --observe 2 --steps 10000 --out runs/pendulum
+    beliefrl train predictive-sac gym:Pendulum-v1 --observe 2 --steps 8000 --out runs/pendulum
     python examples/04_deploying.py runs/pendulum     # a run on a Gymnasium environment: 12 s of CPU time
     python examples/04_deploying.py --quick           # trains a small agent first: 30 s of CPU time
 
