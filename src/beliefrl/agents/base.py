@@ -65,6 +65,7 @@ class ControllerAgent:
         "tau": Range(1e-3, 2e-2, "log"),
         "policy_layers": ((64, 64), (128, 128), (256, 256)),
         "value_layers": ((64, 64), (128, 128), (256, 256)),
+        "actor_regulariser": (0.0, 1e-4, 1e-3),
     }
 
     def __post_init__(self) -> None:
