@@ -105,7 +105,7 @@ class PredictiveSACAgent(ControllerAgent):
     """Layer normalisation, without gains, before each activation of the Q networks (Ba et al. 2016)."""
     critic_likelihood: float = 0.1
     """w ≥ 0: the loss of Q is the squared error plus w times the negative log likelihood. If w > 0, Q also has a σ."""
-    actor_regulariser: float = 1e-4
+    actor_regulariser: float = 1e-3
     """Weight, in units of u, of half the mean square of the policy's μ in the actor's loss; 0 is off."""
 
     # The model
