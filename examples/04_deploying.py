@@ -3,7 +3,7 @@
     pip install -c constraints.txt -e .             # in a clone of the repository
     beliefrl train predictive-sac gym:Pendulum-v1 --observe 2 --steps 8000 --out runs/pendulum
     python examples/04_deploying.py runs/pendulum     # a run on a Gymnasium environment: 12 s of CPU time
-    python examples/04_deploying.py --quick           # trains a small agent first: 30 s of CPU time
+    python examples/04_deploying.py --quick           # trains a small agent first: 25 s of CPU time
 
 Inputs and outputs are numpy arrays. `state` is the recurrent memory: pass it to the next call, or None at the start of
 an episode. The reward of the last step is an input, since the belief depends on it. If a sensor value is not finite,
@@ -23,7 +23,7 @@ import beliefrl
 def main(run: tyro.conf.Positional[str] = "runs/pendulum", episodes: int = 3, quick: bool = False) -> None:
     """Play in the run's environment; then export the policy, load the file, and compare the first actions."""
     if quick:
-        agent = beliefrl.make_agent("sac-lstm", step_start_rl=200, pretrain_updates=0, d_size=32, policy_layers=(32,))
+        agent = beliefrl.make_agent("predictive-sac", step_start_rl=200, pretrain_updates=50, d_size=32)
         run, task = "runs/pendulum-quick", beliefrl.make_task("gym:Pendulum-v1", observe=2)
         beliefrl.train(agent, task, run, resume=True, steps=300)
     policy = beliefrl.load(run)
