@@ -1,7 +1,7 @@
 """Train on your own environment with Gymnasium's interface: here a cart that must drive to a mark and stop there.
 
     pip install -c constraints.txt -e .                    # in a clone of the repository
-    python examples/01_your_own_environment.py             # 6,000 steps: about a minute of CPU time
+    python examples/01_your_own_environment.py             # 6,000 steps: half a minute on two cores
     python examples/01_your_own_environment.py --quick     # 600 steps, to see it run: 22 s of CPU time
 
 A registered environment needs no Python code. Here `my_robots` is a module that registers one:

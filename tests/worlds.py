@@ -97,6 +97,14 @@ class Counting:
         return {"success": state >= 5}
 
 
+class Alternating(Counting):
+    """Its reward is the action, with a sign that changes at each step."""
+
+    def step(self, state, action, key):
+        state, obs, _, terminated = super().step(state, action, key)
+        return state, obs, jnp.where(state % 2 == 0, action[0], -action[0]), terminated
+
+
 class CountingState(NamedTuple):
     offset: Any  # what `refresh` can see changing
     seen: Any  # transitions that were checked

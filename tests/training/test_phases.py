@@ -13,8 +13,7 @@ from beliefrl.training.log import without
 from beliefrl.training.rollout import Episode
 from beliefrl.training.schedule import Event, Phase
 from beliefrl.types import UserError
-from training.test_rollout import Alternating
-from worlds import MODELS, SEQUENCES, SHARED, Counting, CountingAgent, leaves, trained
+from worlds import MODELS, SEQUENCES, SHARED, Alternating, Counting, CountingAgent, leaves, trained
 
 SMALL = {
     "vrm": MODELS | SEQUENCES | {"standardise": True},

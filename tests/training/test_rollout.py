@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from beliefrl.training import replay as ring
 from beliefrl.training import rollout
 from beliefrl.types import StoredTimestep, Timestep, UserError, WindowShape, transitions
-from worlds import Counting, CountingAgent
+from worlds import Alternating, Counting, CountingAgent
 
 
 def timestep(number, is_first):
@@ -209,14 +209,6 @@ def test_evaluation_plays_whole_episodes_and_stops_counting_at_their_end():
         np.testing.assert_array_equal(result.episode_return, total)
         np.testing.assert_array_equal(result.length, length)
         np.testing.assert_array_equal(result.measures["success"], length >= 5)
-
-
-class Alternating(Counting):
-    """Pays the action, by turns added and subtracted."""
-
-    def step(self, state, action, key):
-        state, obs, _, terminated = super().step(state, action, key)
-        return state, obs, jnp.where(state % 2 == 0, action[0], -action[0]), terminated
 
 
 def test_evaluation_draws_each_sampled_action_anew():
