@@ -72,6 +72,7 @@ MISTAKES = {
     f"{TRAIN} --init-from damaged": "damaged/agent.safetensors is damaged",
     f"{TRAIN} --init-from damaged --init-best": "damaged has no best agent yet",
     f"{TRAIN} --init-best": "init_best=True needs init_from",
+    f"{TRAIN} --init-replay": "init_replay=True needs init_from",
     f"{TRAIN} --out there": "there exists already",
     f"{TRAIN} --out there/file/run": "there/file/run cannot be made",
     "sweep": "There is nothing to run",

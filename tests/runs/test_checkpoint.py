@@ -172,7 +172,7 @@ def test_every_flipped_byte_is_known(three):
             changed[position] ^= 1
             path.write_bytes(changed)
             with pytest.raises(UserError):
-                Checkpoints(folder, keep=3)._checked(newest)
+                checkpoint.checked(newest)
             path.write_bytes(content)
     assert restored(folder).step == 30
 
@@ -349,7 +349,7 @@ def test_the_last_good_one_of_a_lost_seed_is_kept(tmp_path):
         ring.add(1, 1)
         checkpoints.forget_timesteps()
         saved(checkpoints, ring, step)
-    content = Checkpoints(tmp_path, keep=1)._checked(kept)
+    content = checkpoint.checked(kept)
     assert content["step"] == 1
 
 

@@ -310,7 +310,7 @@ def test_optimisers_start_anew(source):
     keys = jax.random.split(jax.random.key(1), 2)
     states = jax.vmap(lambda key: AGENT.init(key, TASK.spec))(keys)
     (source.folder / initial.FILE).write_bytes(source.agents().read_bytes())
-    started = initial.started(source.folder, AGENT, states)
+    started = initial.started_states(source.folder, AGENT, states)
     jax.tree.map(np.testing.assert_array_equal, started.controller_optimiser, states.controller_optimiser)
     assert jax.tree.structure(started) == jax.tree.structure(states)
 
@@ -318,9 +318,9 @@ def test_optimisers_start_anew(source):
 def test_an_agent_with_averaged_weights_starts_from_them(tmp_path):
     source, agent = saved(tmp_path / "source", "predictive-sac", TASK), tiny("predictive-sac")
     networks, _ = initial.taken(Options(init_from=str(source.folder)), agent, TASK.spec)
-    initial.write(tmp_path, networks)
+    initial.write(tmp_path, {initial.FILE: networks})
     states = jax.vmap(lambda key: agent.init(key, TASK.spec))(jax.random.split(jax.random.key(9), 1))
-    started = agent.networks(initial.started(tmp_path, agent, states))
+    started = agent.networks(initial.started_states(tmp_path, agent, states))
     there = {jax.tree_util.keystr(where): leaf for where, leaf in jax.tree_util.tree_leaves_with_path(started)}
     assert there.keys() == networks.keys()
     saved_there = arrays.load(source.agents())

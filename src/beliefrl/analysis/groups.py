@@ -166,7 +166,8 @@ def groups(
     return sorted(merged, key=lambda group: (tasks.index(group.task), labels.index(group.label)))
 
 
-OPTIONS = ("envs", "overlap", "init_from", "init_best", "precision", "replay_capacity")  # that can change a return
+# Options that can change a return.
+OPTIONS = ("envs", "overlap", "init_from", "init_best", "init_replay", "precision", "replay_capacity")
 
 
 def _options(run: Run) -> list[str]:

@@ -11,6 +11,7 @@ The manifest has the size and SHA-256 of each file: a damaged checkpoint is dete
 Files are plain numbers and JSON: reading them runs no code.
 """
 
+import contextlib
 import hashlib
 import json
 import os
@@ -184,7 +185,7 @@ class Checkpoints:
         passed_over = []
         for path in self._listed():
             try:
-                content = self._checked(path)
+                content = checked(path)
             except Damaged as error:
                 passed_over.append(str(error))
                 path.rename(path.with_name(f"damaged-{path.name}"))
@@ -198,19 +199,18 @@ class Checkpoints:
         why = f": {passed_over[0]}" if passed_over else "."
         raise UserError(f"{self.folder.parent} has no checkpoint to continue from{why}")
 
-    def _checked(self, path: pathlib.Path) -> dict[str, Any]:
-        """The manifest. Every file that it names has been checked."""
-        content = _content(path)
-        if content.get("format") != FORMAT:
-            raise UserError(
-                f"{path} was written in format {content.get('format')}, and this version of BeliefRL reads {FORMAT}: "
-                "resume with the version that config.json names."
-            )
-        for name, file in content["files"].items():
-            _check(path / name, file["size"], file["sha256"])
-        for segment in content["replay"]:
-            _check(self.folder / "replay" / segment["file"], segment["size"], segment["sha256"])
-        return content
+
+def stored_timesteps(folder: pathlib.Path) -> tuple[int, list[Segment]]:
+    """The step of a run's newest undamaged checkpoint, and its files of timesteps. Nothing in `folder` changes.
+
+    Raises:
+        UserError: there is no undamaged checkpoint, or it is from another version.
+    """
+    for path in sorted(listed(folder), reverse=True):
+        with contextlib.suppress(Damaged):
+            content = checked(path)
+            return content["step"], [Segment(**segment) for segment in content["replay"]]
+    raise UserError(f"{folder} has no undamaged checkpoint, so it cannot give its replay: leave init_replay out.")
 
 
 def listed(folder: pathlib.Path) -> list[pathlib.Path]:
@@ -248,6 +248,21 @@ def _canonical(content: dict[str, Any]) -> bytes:
 
 def _signed(content: dict[str, Any]) -> bytes:
     return json.dumps({"content": content, "sha256": _sha256(_canonical(content))}, indent=1).encode()
+
+
+def checked(path: pathlib.Path) -> dict[str, Any]:
+    """The content of a checkpoint's manifest. Every file that it names has been checked."""
+    content = _content(path)
+    if content.get("format") != FORMAT:
+        raise UserError(
+            f"{path} was written in format {content.get('format')}, and this version of BeliefRL reads {FORMAT}: "
+            "use the version that config.json names."
+        )
+    for name, file in content["files"].items():
+        _check(path / name, file["size"], file["sha256"])
+    for segment in content["replay"]:
+        _check(path.parent / "replay" / segment["file"], segment["size"], segment["sha256"])
+    return content
 
 
 def _content(path: pathlib.Path) -> dict[str, Any]:

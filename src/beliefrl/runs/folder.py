@@ -14,8 +14,8 @@ from beliefrl.types import UserError, cause, plain
 
 MAKING = r"metrics|lock|\.config\.json\.tmp"  # files that are made before config.json
 UNSAVED = (  # files of a training that has saved no agent and no checkpoint
-    rf"{MAKING}|config\.json|metrics/seed-\d+\.jsonl|\.[\w.]+\.tmp|(tensorboard|wandb)(/.*)?"
-    r"|initial\.safetensors|checkpoints(/replay(/.*)?|/\.[^/]*\.tmp(/.*)?)?"
+    rf"{MAKING}|config\.json|metrics/seed-\d+\.jsonl|\.[\w.-]+\.tmp|(tensorboard|wandb)(/.*)?"
+    r"|initial(-replay)?\.safetensors|checkpoints(/replay(/.*)?|/\.[^/]*\.tmp(/.*)?)?"
 )
 
 

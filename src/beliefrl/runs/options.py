@@ -42,6 +42,8 @@ class Options:
     starts from the same seed there. If that run has fewer seeds, they are reused in a cycle. None: random networks."""
     init_best: bool = False
     """Take the best agent of init_from instead of its last one."""
+    init_replay: bool = False
+    """Also start with the replay of init_from's last checkpoint. The task and `envs` must be the same there."""
     replay_capacity: int = 1_000_000
     """Maximum number of timesteps in a seed's replay. New ones replace the oldest."""
     processes: Processes = "auto"
@@ -76,6 +78,7 @@ class Options:
         check_choice(self, "processes", get_args(Processes))
         check_choice(self, "precision", get_args(Precision))
         check_choice(self, "init_best", (True, False))
+        check_choice(self, "init_replay", (True, False))
         check_choice(self, "overlap", (True, False))
         if self.stop_at is not None:
             check_range(self, ("stop_at",), -LARGEST)
@@ -83,6 +86,8 @@ class Options:
             raise UserError(f"init_from={self.init_from!r} is impossible: it must be the path of a run's folder.")
         if self.init_best and self.init_from is None:
             raise UserError("init_best=True needs init_from: name the run whose best agent is taken.")
+        if self.init_replay and self.init_from is None:
+            raise UserError("init_replay=True needs init_from: name the run whose replay is taken.")
         if self.step_timeout is not None:
             check_range(self, ("step_timeout",), 0.001, MOST_SECONDS)
             if self.processes == "never":

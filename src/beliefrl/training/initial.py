@@ -17,9 +17,17 @@ from beliefrl.agents.hyperparameters import values_before
 from beliefrl.runs import arrays, best
 from beliefrl.runs.options import Options
 from beliefrl.runs.run import Run
+from beliefrl.training import initial_replay
+from beliefrl.training.phases import SeedState
 from beliefrl.types import Spec, UserError
 
 FILE = "initial.safetensors"
+
+
+def seeds_there(options: Options) -> list[int]:
+    """The index of the seed in the other run, for each seed of this training."""
+    source = Run(options.init_from or "")
+    return [(seed - source.seeds[0]) % len(source.seeds) for seed in range(options.seed, options.seed + options.seeds)]
 
 
 def taken(options: Options, agent: Agent, spec: Spec) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -40,10 +48,8 @@ def taken(options: Options, agent: Agent, spec: Spec) -> tuple[dict[str, np.ndar
             _refuse_other_critics(source, agent)  # a hyperparameter says more than the first array that differs
         raise
     _refuse_other_critics(source, agent)
-    first, count = source.seeds[0], len(source.seeds)
-    seeds = range(options.seed, options.seed + options.seeds)
-    index = [(seed - first) % count for seed in seeds]
-    ends = best.evaluations(source.folder, count) if options.init_best else _last_steps(source)
+    seeds, index = range(options.seed, options.seed + options.seeds), seeds_there(options)
+    ends = best.evaluations(source.folder, len(source.seeds)) if options.init_best else _last_steps(source)
     session = [source.config, *source.config.get("resumed", ())][-1]
     origin = {
         "run": str(source.folder),
@@ -56,12 +62,21 @@ def taken(options: Options, agent: Agent, spec: Spec) -> tuple[dict[str, np.ndar
     return {name: array[index] for name, array in saved.items()}, origin
 
 
-def write(folder: pathlib.Path, networks: dict[str, np.ndarray]) -> None:
-    """Write the initial networks to a run's folder."""
-    arrays.write_whole(folder / FILE, arrays.packed(networks))
+def write(folder: pathlib.Path, files: dict[str, dict[str, np.ndarray]]) -> None:
+    """Write the initial arrays to files of these names in a run's folder."""
+    for name, content in files.items():
+        arrays.write_whole(folder / name, arrays.packed(content))
 
 
-def started(folder: pathlib.Path, agent: Agent, states: Any) -> Any:
+def started(folder: pathlib.Path, agent: Agent, seeds: SeedState) -> SeedState:
+    """The seeds of a training before its first step, with the initial arrays in a run's folder."""
+    seeds = seeds._replace(state=started_states(folder, agent, seeds.state))
+    if (folder / initial_replay.FILE).exists():
+        seeds = seeds._replace(replay=initial_replay.started(folder, seeds.replay))
+    return seeds
+
+
+def started_states(folder: pathlib.Path, agent: Agent, states: Any) -> Any:
     """The first states of a training, leaves (seed, ...), with the initial networks in a run's folder.
 
     Raises:

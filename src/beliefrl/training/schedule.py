@@ -89,7 +89,8 @@ def stages(
     restore: Callable[[SeedState], Snapshot] | None = None,
     notify: Callable[[str], None] | None = None,
     own_process: bool = False,
-    initial: Callable[[Any], Any] | None = None,
+    initial: Callable[[SeedState], SeedState] | None = None,
+    taken: int = 0,
 ) -> Generator[Event, None, None]:
     """Train; yields an Event before each long operation, and after each operation with results.
 
@@ -100,14 +101,15 @@ def stages(
         restore: given the shapes of a training's arrays, returns the snapshot from which to continue.
         notify: called from another thread with a sentence that cannot wait for the next Event.
         own_process: as in `train`.
-        initial: given the agents' random first states, returns the states to start from (`initial.started`). There is
-            no pre-training then, because the networks of the other run have had one.
+        initial: given the seeds of a new training, returns them with the arrays of another run (`initial.started`).
+            There is no pre-training then, because the networks of the other run have had one.
+        taken: the largest number of timesteps that a ring has from the other run.
 
     Raises:
         Fault: a Gymnasium environment failed. It is raised after an Event with everything learned until then.
     """
     numbers = range(options.seed, options.seed + options.seeds)
-    sizes = capacity(agent, options), options.eval_episodes
+    sizes = capacity(agent, options, taken), options.eval_episodes
     if isinstance(task, GymnasiumTask):
         yield Event(Phase.MAKING_ENVIRONMENTS, 0)
         if own_process:
@@ -122,7 +124,7 @@ def stages(
         if restore is None:
             yield Event(Phase.COMPILING_AGENT, 0)
             seeds = program.begin(of_seeds)
-            seeds = seeds if initial is None else seeds._replace(state=initial(seeds.state))
+            seeds = seeds if initial is None else initial(seeds)
         else:
             at, seeds = restore(program.shapes(of_seeds))
             seeds = program.revive(seeds, at.step)
@@ -207,10 +209,11 @@ def _stages(
 ROOM = 1.25  # timesteps in the replay per step: with episodes of at least 4 steps it has the whole training
 
 
-def capacity(agent: Agent, options: Options) -> int:
+def capacity(agent: Agent, options: Options, taken: int = 0) -> int:
     """Timesteps in the replay of each environment: one for each of its steps, and room for those that end episodes.
 
-    If episodes are shorter than 4 steps on average, the oldest timesteps are replaced before the training ends.
+    There is also room for `taken` timesteps from another run. If episodes are shorter than 4 steps on average, the
+    oldest timesteps are replaced before the training ends.
 
     Raises:
         UserError: `replay_capacity` has no room for the exploration, or for a window.
@@ -222,7 +225,7 @@ def capacity(agent: Agent, options: Options) -> int:
             f"replay_capacity={options.replay_capacity} is too small: this agent needs at least "
             f"{needed * options.envs}."
         )
-    return min(options.replay_capacity // options.envs, max(int(ROOM * steps), min(needed, 2 * steps)))
+    return min(options.replay_capacity // options.envs, max(int(ROOM * steps), min(needed, 2 * steps)) + taken)
 
 
 def _processes(options: Options, own_process: bool) -> Processes:

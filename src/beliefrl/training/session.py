@@ -64,19 +64,18 @@ class Session:
     def run(
         self,
         restore: Callable[[SeedState], Snapshot] | None = None,
-        networks: dict[str, np.ndarray] | None = None,
+        files: dict[str, dict[str, np.ndarray]] | None = None,
     ) -> Run:
         """Train to the last step, or until something ends the training before it.
 
         Args:
             restore: `Session.restore`, to continue from a checkpoint.
-            networks: the first networks of a new training, if they come from another run (`initial.taken`).
+            files: the arrays of a new training that come from another run, by the names of their files.
         """
         keep_compiled(self._note)
         try:
             with self.recorder, jax.default_matmul_precision(self.options.precision):
-                if networks is not None:
-                    initial.write(self.recorder.folder, networks)
+                initial.write(self.recorder.folder, files or {})
                 self._train(restore)
         except OSError as error:
             raise UserError(
@@ -88,7 +87,9 @@ class Session:
     def _train(self, restore: Callable[[SeedState], Snapshot] | None) -> None:
         try:
             start = partial(initial.started, self.recorder.folder, self.agent) if self.given else None
-            events = stages(self.agent, self.task, self.options, restore, self._note, self.own_process, start)
+            taken = self.recorder.config.get("initial", {}).get("timesteps", 0)
+            given = self.own_process, start, taken
+            events = stages(self.agent, self.task, self.options, restore, self._note, *given)
             with self.checkpoints, self.requests, contextlib.closing(events):
                 for event in events:
                     if self.was_finished or self._listen(event):

@@ -15,7 +15,7 @@ from beliefrl.runs.run import Recorder, Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.given import given
 from beliefrl.tasks.gymnasium import GymnasiumTask
-from beliefrl.training import checks, initial
+from beliefrl.training import checks, initial, initial_replay
 from beliefrl.training.evaluation import agent_of, check_interface, task_of
 from beliefrl.training.schedule import Event, Options, capacity
 from beliefrl.training.session import Callback, Session
@@ -53,8 +53,8 @@ def train(
         resume: continue the training in `out`, if there is one already. It must have been started with the same
             agent, task and options. `steps` may be larger; stop_at, stop_patience and step_timeout may be different.
         options: the fields of `Options`: steps, seeds, seed, envs, overlap, eval_every, eval_episodes, stop_at,
-            stop_patience, init_from, init_best, replay_capacity, processes, step_timeout, checkpoint_steps,
-            checkpoint_minutes, keep_checkpoints, precision, track. init_from may be a Run.
+            stop_patience, init_from, init_best, init_replay, replay_capacity, processes, step_timeout,
+            checkpoint_steps, checkpoint_minutes, keep_checkpoints, precision, track. init_from may be a Run.
 
     Returns:
         The run: its results, its log, its files (`runs`). It is finished, unless the callback has stopped it.
@@ -83,12 +83,15 @@ def train(
         checks.same(run, config, hyperparameters.values_before(agent))
         changes = {name: getattr(chosen, name) for name in checks.CHANGEABLE}
         return _go_on(run, changes, made, (report, callback), own, own_process, progress)
-    networks = None
+    files = {}
     if chosen.init_from is not None:
-        networks, config["initial"] = initial.taken(chosen, agent, made.spec)
+        files[initial.FILE], config["initial"] = initial.taken(chosen, agent, made.spec)
+    if chosen.init_replay:
+        files[initial_replay.FILE], about = initial_replay.taken(chosen, agent, made, initial.seeds_there(chosen))
+        config["initial"] |= about
     recorder = Recorder(out or free_folder(f"{config['agent']}-{config['task']}"), config)
     with _reporting(recorder, report, callback, progress) as listen:
-        return Session(recorder, agent, made, chosen, listen, own_process).run(networks=networks)
+        return Session(recorder, agent, made, chosen, listen, own_process).run(files=files)
 
 
 def resume(
