@@ -192,7 +192,7 @@ def _origin(initial: dict[str, Any]) -> str:
     """Where the initial networks of a run come from."""
     which = "best" if initial.get("best") else "last"
     source = f"{initial.get('run')} ({initial.get('agent')} on {initial.get('task')})"
-    replay = f", with {taken:,} timesteps of its replay" if (taken := initial.get("timesteps")) else ""
+    replay = f", and its replay (at most {taken:,} timesteps)" if (taken := initial.get("timesteps")) else ""
     return f"{which} agent of {source}, commit {initial.get('git_commit')}{replay}"
 
 
