@@ -64,6 +64,8 @@ MISTAKES = {
     f"{TRAIN} --constants mass=2 mass=3": "--constants has mass twice",
     "check my_robots:Arm-v0": "did you mean gym:my_robots:Arm-v0?",
     f"{TRAIN} --overlap": "overlap needs a Gymnasium environment",
+    f"{TRAIN} --share-env": "share_env needs a Gymnasium environment",
+    f"{TRAIN} --share-env --envs 2": "share_env=True is impossible with envs=2",
     f"{TRAIN} --step-timeout 0": "step_timeout=0.0 is impossible",
     f"{TRAIN} --step-timeout 5 --processes never": "step_timeout needs a process for each environment",
     f"{TRAIN} --init-from missing": "no run folder missing",

@@ -167,7 +167,7 @@ def groups(
 
 
 # Options that can change a return.
-OPTIONS = ("envs", "overlap", "init_from", "init_best", "init_replay", "precision", "replay_capacity")
+OPTIONS = ("envs", "overlap", "share_env", "init_from", "init_best", "init_replay", "precision", "replay_capacity")
 
 
 def _options(run: Run) -> list[str]:

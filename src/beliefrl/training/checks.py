@@ -27,6 +27,10 @@ def possible(options: Options, task: Any, own_process: bool) -> None:
             "overlap needs a Gymnasium environment: a task in JAX is compiled together with the updates. Leave the "
             "option out."
         )
+    if options.share_env and not isinstance(task, GymnasiumTask):
+        raise UserError(
+            "share_env needs a Gymnasium environment: a task in JAX is only a function. Leave the option out."
+        )
     if options.step_timeout and isinstance(task, GymnasiumTask) and options.processes == "auto" and not own_process:
         raise UserError(
             "step_timeout needs a process for each environment: from Python, give own_process=True, and guard the "

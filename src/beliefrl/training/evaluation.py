@@ -19,6 +19,7 @@ from beliefrl.tasks.given import given
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.compilation import keep_compiled
 from beliefrl.training.host_evaluation import Evaluation
+from beliefrl.training.lockstep import Lockstep
 from beliefrl.training.phases import evaluate as evaluate_seed
 from beliefrl.training.rollout import Episode
 from beliefrl.types import UserError, check_whole, one_line, tuples
@@ -211,7 +212,7 @@ def evaluate(
     keys = jax.random.split(jax.random.key(seed), len(run.seeds))
     with _showing(progress, 2 * episodes * len(run.seeds)) as ended, jax.default_matmul_precision(precision):
         if isinstance(found, GymnasiumTask):
-            result = _on_host(trained, found, states, keys, episodes, run.seeds, ended)
+            result = _on_host(trained, found, states, keys, episodes, run, ended)
         else:
             compiled = jax.jit(jax.vmap(lambda state, key: evaluate_seed(trained, found, state, key, episodes)))
             result = jax.block_until_ready(compiled(states, keys))
@@ -233,11 +234,14 @@ def _on_host(
     states: Any,
     keys: Key[Array, " seed"],
     episodes: int,
-    seeds: list[int],
+    run: Run,
     ended: Callable[[int], None],
 ) -> Episode:
-    evaluation = Evaluation(agent, task, seeds, "never")
-    try:
+    with contextlib.ExitStack() as closing:
+        shared = None
+        if run.options.share_env:
+            shared = Lockstep(task, [f"seed {seed}" for seed in run.seeds])
+            closing.callback(shared.close)
+        evaluation = Evaluation(agent, task, run.seeds, "never", shared=shared)
+        closing.callback(evaluation.close)
         return evaluation.play(states, keys, episodes, ended)
-    finally:
-        evaluation.close()

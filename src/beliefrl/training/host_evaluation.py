@@ -18,7 +18,7 @@ from beliefrl.types import Spec, Timestep
 
 
 class Evaluation:
-    """Environments for evaluation: two for each seed, one played with sampled and one with mode actions."""
+    """Episodes with sampled and with mode actions, in environments of their own or in those of the training."""
 
     def __init__(
         self,
@@ -28,11 +28,16 @@ class Evaluation:
         processes: str,
         notify: Callable[[str], None] | None = None,
         timeout: float | None = None,
+        shared: Lockstep | None = None,
     ):
-        """The environments are made at the first evaluation. The last three arguments are those of `Lockstep`."""
+        """Args: `processes`, `notify` and `timeout` are those of `Lockstep`.
+
+        `shared` has one environment for each seed. If it is None, two for each seed are made at the first evaluation,
+        and sampled and mode actions are played side by side.
+        """
         self.agent, self.task, self.seeds = agent, task, seeds
         self._how = processes, notify, timeout
-        self.environments: Lockstep | None = None
+        self.shared, self.environments = shared, shared
         lanes = jax.vmap(partial(_perceive, agent, task.spec), in_axes=(None, 0, 0, 0, 0, None))
         self._perceive = jax.jit(jax.vmap(lanes, in_axes=(0, 0, 0, 0, None, None)))
 
@@ -47,8 +52,25 @@ class Evaluation:
         if self.environments is None:
             lanes = [f"evaluation of seed {seed}" for seed in self.seeds for _ in range(2)]
             self.environments = Lockstep(self.task, lanes, *self._how)
-        keys = jax.vmap(lambda key: jax.random.split(key, 2))(keys)
-        obs = self.environments.reset(environment_seeds(keys).reshape(-1))
+        keys, explore = jax.vmap(lambda key: jax.random.split(key, 2))(keys), np.array([True, False])
+        if self.shared is None:
+            return self._play(self.environments, states, keys, explore, episodes, ended)
+        sampled = self._play(self.shared, states, keys[:, :1], explore[:1], episodes, ended)
+        before = sampled.done.size
+        mode = self._play(self.shared, states, keys[:, 1:], explore[1:], episodes, lambda count: ended(before + count))
+        return jax.tree.map(lambda *each: np.concatenate(each, axis=1), sampled, mode)
+
+    def _play(
+        self,
+        environments: Lockstep,
+        states: Any,
+        keys: Key[Array, "seed lane"],
+        explore: Bool[np.ndarray, " lane"],
+        episodes: int,
+        ended: Callable[[int], None],
+    ) -> Episode:
+        """Episodes in every lane of every seed; leaves (seed, lane, episodes). `explore` says which are sampled."""
+        obs = environments.reset(environment_seeds(keys).reshape(-1))
         lanes = len(obs)
         action: Any = np.zeros((lanes, self.task.spec.action_dim), np.float32)
         never: Any = np.zeros(lanes, bool)
@@ -56,25 +78,26 @@ class Evaluation:
         empty = self.agent.reset(self.task.spec)
         memory = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*keys.shape, *leaf.shape)), empty)
         record, returns, length = _Record(self.task.spec, lanes, episodes), np.zeros(lanes), np.zeros(lanes, int)
-        explore, time = np.array([True, False]), 0
+        time = 0
         while not record.full:
             perceived = jax.tree.map(lambda leaf: leaf.reshape(*keys.shape, *leaf.shape[1:]), step)
             action, memory = self._perceive(states, memory, perceived, keys, explore, time)
             action = np.asarray(action).reshape(lanes, -1)
-            obs, reward, terminated, truncated, measures = self.environments.step(action)
+            obs, reward, terminated, truncated, measures = environments.step(action)
             returns, length, done, time = returns + reward, length + 1, terminated | truncated, time + 1
             now: Any = done, returns, length, measures
             record.add(Episode(*now))
             if done.any():
-                obs = self.environments.restart(done)
-                returns, length = np.where(done, 0.0, returns), np.where(done, 0, length)
                 ended(int(record.episodes.done.sum()))
+            if done.any() and not record.full:
+                obs = environments.restart(done)
+                returns, length = np.where(done, 0.0, returns), np.where(done, 0, length)
             step = Timestep(obs, reward * ~done, action * ~done[:, None], done, never)
         return jax.tree.map(lambda leaf: leaf.reshape(*keys.shape, episodes), record.episodes)
 
     def close(self) -> None:
-        """Close the environments, if there are any."""
-        if self.environments is not None:
+        """Close the environments of its own, if there are any."""
+        if self.environments is not None and self.shared is None:
             self.environments.close()
 
 

@@ -51,15 +51,18 @@ def program(
     timeout: float | None = None,
     envs: int = 1,
     overlap: bool = False,
+    share: bool = False,
 ) -> Program:
     """The phases of training, with `envs` environments for each of `seeds`.
 
-    `processes`, `notify` and `timeout` are those of `Lockstep`. With `overlap`, updates are made during steps.
+    `processes`, `notify` and `timeout` are those of `Lockstep`. With `overlap`, updates are made during steps. With
+    `share`, evaluations take place in the environments of the training, where a new episode begins after them.
     """
     copies = [""] if envs == 1 else [f", environment {copy}" for copy in range(envs)]
     lanes = [f"seed {seed}{copy}" for seed in seeds for copy in copies]
     loop = HostLoop(agent, task, capacity, Lockstep(task, lanes, processes, notify, timeout), envs, overlap)
-    evaluation = Evaluation(agent, task, seeds, processes, notify, timeout)
+    shared = loop.environments if share else None
+    evaluation = Evaluation(agent, task, seeds, processes, notify, timeout, shared)
 
     def close() -> None:
         loop.close()
@@ -74,6 +77,7 @@ def program(
         evaluate=partial(evaluation.play, episodes=episodes),
         shapes=loop.shapes,
         revive=loop.revive,
+        **({"after_evaluation": loop.revive} if share else {}),
         close=close,
     )
 
@@ -147,7 +151,7 @@ class HostLoop:
         return obs.reshape(*keys.shape, -1)
 
     def revive(self, seeds: SeedState, step: int) -> SeedState:
-        """Seeds read from a checkpoint, which has no environments: a new episode begins in each."""
+        """Seeds for which a new episode begins in each environment: a checkpoint has none, an evaluation used them."""
         keys = jax.vmap(lambda key: step_key(key, jnp.asarray(step), REVIVE))(seeds.key)
         return seeds._replace(actor=self._first(self._reset(keys)))
 

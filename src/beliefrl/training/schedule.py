@@ -115,7 +115,7 @@ def stages(
         if own_process:
             host_loop.keep_memory()
         processes = _processes(options, own_process)
-        how = options.step_timeout, options.envs, options.overlap
+        how = options.step_timeout, options.envs, options.overlap, options.share_env
         program = host_loop.program(agent, task, *sizes, numbers, processes, notify, *how)
     else:
         program = phases.compile_program(agent, task, *sizes, options.envs)
@@ -153,7 +153,7 @@ def _stages(
 
     if at.evaluated // options.eval_every < at.step // options.eval_every:  # a fault came before the end of this one
         yield from _evaluation(agent, program, seeds, at.step, Phase.LEARNING)
-        at = at._replace(evaluated=at.step)
+        seeds, at = program.after_evaluation(seeds, at.step), at._replace(evaluated=at.step)
         yield Event(Phase.LEARNING, at.step, snapshot=Snapshot(at, seeds))
     if at.step < explored:
         yield Event(Phase.COMPILING_EXPLORATION, at.step)
@@ -167,7 +167,7 @@ def _stages(
         yield Event(Phase.EXPLORING, at.step, episodes=log.episodes)
         if at.step // options.eval_every > before // options.eval_every:
             yield from _evaluation(agent, program, seeds, at.step, Phase.EXPLORING)
-            at = at._replace(evaluated=at.step)
+            seeds, at = program.after_evaluation(seeds, at.step), at._replace(evaluated=at.step)
         yield Event(Phase.EXPLORING, at.step, snapshot=Snapshot(at, seeds))
 
     if at.step < options.steps and agent.pretrain_updates and not at.refreshed:
@@ -197,7 +197,7 @@ def _stages(
         yield Event(Phase.LEARNING, at.step, log.metrics, log.episodes)
         if at.step // options.eval_every > before // options.eval_every:
             yield from _evaluation(agent, program, seeds, at.step, Phase.LEARNING)
-            at = at._replace(evaluated=at.step)
+            seeds, at = program.after_evaluation(seeds, at.step), at._replace(evaluated=at.step)
         yield Event(Phase.LEARNING, at.step, snapshot=Snapshot(at, seeds))
     last = None
     if at.evaluated < at.step:

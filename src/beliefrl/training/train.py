@@ -52,9 +52,10 @@ def train(
             for each phase and each evaluation, and at least one per minute. False shows nothing.
         resume: continue the training in `out`, if there is one already. It must have been started with the same
             agent, task and options. `steps` may be larger; stop_at, stop_patience and step_timeout may be different.
-        options: the fields of `Options`: steps, seeds, seed, envs, overlap, eval_every, eval_episodes, stop_at,
-            stop_patience, init_from, init_best, init_replay, replay_capacity, processes, step_timeout,
-            checkpoint_steps, checkpoint_minutes, keep_checkpoints, precision, track. init_from may be a Run.
+        options: the fields of `Options`: steps, seeds, seed, envs, overlap, share_env, eval_every,
+            eval_episodes, stop_at, stop_patience, init_from, init_best, init_replay, replay_capacity, processes,
+            step_timeout, checkpoint_steps, checkpoint_minutes, keep_checkpoints, precision, track. init_from may be a
+            Run.
 
     Returns:
         The run: its results, its log, its files (`runs`). It is finished, unless the callback has stopped it.
