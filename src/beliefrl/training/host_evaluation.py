@@ -30,10 +30,10 @@ class Evaluation:
         timeout: float | None = None,
         shared: Lockstep | None = None,
     ):
-        """Args: `processes`, `notify` and `timeout` are those of `Lockstep`.
+        """`processes`, `notify` and `timeout` are those of `Lockstep`.
 
-        `shared` has one environment for each seed. If it is None, two for each seed are made at the first evaluation,
-        and sampled and mode actions are played side by side.
+        `shared` are the environments of the training, one for each seed. If it is None, two for each seed are made at
+        the first evaluation, one for sampled and one for mode actions.
         """
         self.agent, self.task, self.seeds = agent, task, seeds
         self._how = processes, notify, timeout
