@@ -34,10 +34,12 @@ def source(tmp_path):
     return written(tmp_path / "source", capacity=20, added=(7, 12))
 
 
-def written(folder, capacity, added):
+def written(folder, capacity, added, first=None):
     run = saved(folder, "sac-mlp", TASK, seeds=2)
     with Checkpoints(run.folder, 2) as checkpoints:
         rings = numbered(2, capacity=capacity, added=added)
+        if first is not None:
+            rings.step.reward[0, 0] = first
         checkpoints.save(30, {}, {"any": np.zeros(2)}, rings, np.array(added))
     return run
 
@@ -52,6 +54,12 @@ def test_each_seed_has_the_timesteps_of_its_own_ring_in_order(source):
     np.testing.assert_array_equal(found["added"], [12, 7, 12])
     np.testing.assert_array_equal(found[".step.reward"][0], 100 + np.arange(12))
     np.testing.assert_array_equal(found[".step.reward"][1], [*range(7), 0, 0, 0, 0, 0])
+
+
+def test_a_longer_ring_that_is_not_taken_does_not_count(source):
+    found, about = taken(source, (0,))
+    assert about["timesteps"] == 7
+    assert found[".step.reward"].shape == (1, 7)
 
 
 def test_a_smaller_replay_takes_the_newest(source):
@@ -93,7 +101,24 @@ def test_timesteps_of_another_task_are_one_sentence_and_no_folder(source, tmp_pa
     assert not (tmp_path / "run").exists()
 
 
+def test_other_notes_are_one_sentence(tmp_path):
+    for before, now, phrase in (((8.0,), (16.0,), r"reward_memory=\[8.0\], and"), ((8.0,), (), "reward_memory=")):
+        old, new = (tiny("predictive-sac", reward_memory=memory) for memory in (before, now))
+        run = saved(tmp_path / str(len(now)), "predictive-sac", TASK, agent=old)
+        with pytest.raises(UserError, match=phrase):
+            initial_replay.taken(Options(init_from=str(run.folder)), new, TASK, [0])
+
+
+def test_the_replay_of_a_diverged_seed_is_not_taken(tmp_path):
+    run = written(tmp_path / "source", 20, (7, 12), first=np.nan)
+    taken(run, (1,))
+    with pytest.raises(UserError, match="has numbers that are not finite, because a seed diverged"):
+        taken(run, (0,))
+
+
 def test_without_a_checkpoint_there_is_no_replay(source, tmp_path):
+    with pytest.raises(UserError, match="has no checkpoint yet"):
+        taken(saved(tmp_path / "new", "sac-mlp", TASK, seeds=2))
     (listed(source.folder)[0] / "manifest.json").write_text("{")
     with pytest.raises(UserError, match="has no undamaged checkpoint, so it cannot give its replay"):
         train(AGENT, TASK, tmp_path / "run", init_from=source, init_replay=True)
@@ -129,6 +154,10 @@ def test_a_training_goes_on_from_it_and_needs_the_other_run_no_more(tmp_path):
     shutil.rmtree(run.folder / "checkpoints")
     for name in ("results.json", "agent.safetensors", "best.safetensors"):
         (run.folder / name).unlink()
+    hidden = (run.folder / initial_replay.FILE).rename(tmp_path / "hidden")
+    with pytest.raises(UserError, match=r"initial-replay.safetensors is damaged: restore it from a copy"):
+        resume(run, progress=False)
+    hidden.rename(run.folder / initial_replay.FILE)
     resume(run, progress=False, callback=lambda event: event.step >= 20)
     assert not (run.folder / "results.json").exists()
     resume(run, progress=False)

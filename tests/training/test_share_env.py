@@ -4,7 +4,8 @@ import jax
 import numpy as np
 import pytest
 
-from beliefrl import UserError, evaluate, train
+from beliefrl import UserError, evaluate, resume, train
+from beliefrl.runs.checkpoint import listed
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.host_evaluation import Evaluation
 from beliefrl.training.lockstep import Lockstep
@@ -14,10 +15,17 @@ from wrong import Fine
 AGENT = tiny("sac-mlp", step_start_rl=20, batch_size=8, pretrain_updates=5)
 
 
-class Only(Fine):
+class Paying(Fine):
+    """The reward is the action."""
+
+    def reward(self):
+        return float(self.action[0])
+
+
+class Only(Paying):
     """There is one robot: a second environment cannot be made before the first is closed."""
 
-    is_taken = False
+    is_taken, is_stuck = False, False
 
     def __init__(self):
         if Only.is_taken:
@@ -25,8 +33,10 @@ class Only(Fine):
         Only.is_taken = True
         super().__init__()
 
-    def reward(self):
-        return float(self.action[0])
+    def reset(self, *, seed=None, options=None):
+        if Only.is_stuck:
+            raise RuntimeError("the robot is stuck")
+        return super().reset(seed=seed, options=options)
 
     def close(self):
         Only.is_taken = False
@@ -34,14 +44,7 @@ class Only(Fine):
 
 @pytest.fixture(autouse=True)
 def free():
-    Only.is_taken = False
-
-
-class Paying(Fine):
-    """The reward is the action."""
-
-    def reward(self):
-        return float(self.action[0])
+    Only.is_taken = Only.is_stuck = False
 
 
 def test_the_returns_are_those_of_other_environments():
@@ -53,12 +56,11 @@ def test_the_returns_are_those_of_other_environments():
     own.close()
     lanes, counts = Lockstep(task, ["a", "b"]), []
     here = Evaluation(AGENT, task, seeds, "never", shared=lanes).play(states, keys, 3, counts.append)
+    lanes.close()
     assert there.episode_return.shape == here.episode_return.shape == (2, 2, 3)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), here, there)
     assert len(np.unique(here.episode_return.round(3))) == 12
     assert counts == [2, 4, 6, 8, 10, 12]
-    lanes.reset(np.array([0, 1]))  # they are still open
-    lanes.close()
 
 
 @pytest.mark.slow
@@ -73,3 +75,17 @@ def test_one_environment_is_enough_and_an_evaluation_ends_its_episode(tmp_path):
     assert not Only.is_taken
     with pytest.raises(UserError, match="the robot is taken"):
         train(AGENT, Only, tmp_path / "other", **options)
+
+
+@pytest.mark.slow
+def test_if_the_reset_after_an_evaluation_fails_what_was_learned_is_kept(tmp_path):
+    def stick(event):
+        Only.is_stuck = Only.is_stuck or event.evaluation is not None
+
+    options = {"steps": 50, "eval_every": 25, "eval_episodes": 2, "progress": False, "share_env": True}
+    with pytest.raises(UserError, match="the robot is stuck"):
+        train(AGENT, Only, tmp_path / "run", stick, **options)
+    assert listed(tmp_path / "run")[-1].name.endswith("-step-25")
+    Only.is_stuck = False
+    run = resume(tmp_path / "run", task=Only, progress=False)
+    assert [row["step"] for row in run.rows(0, "evaluation")] == [25, 50]

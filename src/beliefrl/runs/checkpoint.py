@@ -204,13 +204,15 @@ def stored_timesteps(folder: pathlib.Path) -> tuple[int, list[Segment]]:
     """The step of a run's newest undamaged checkpoint, and its files of timesteps. Nothing in `folder` changes.
 
     Raises:
-        UserError: there is no undamaged checkpoint, or it is from another version.
+        UserError: there is no checkpoint, all are damaged, or the newest is from another version.
     """
-    for path in sorted(listed(folder), reverse=True):
+    found = sorted(listed(folder), reverse=True)
+    for path in found:
         with contextlib.suppress(Damaged):
             content = checked(path)
             return content["step"], [Segment(**segment) for segment in content["replay"]]
-    raise UserError(f"{folder} has no undamaged checkpoint, so it cannot give its replay: leave init_replay out.")
+    which = "undamaged checkpoint" if found else "checkpoint yet"
+    raise UserError(f"{folder} has no {which}, so it cannot give its replay: leave init_replay out.")
 
 
 def listed(folder: pathlib.Path) -> list[pathlib.Path]:

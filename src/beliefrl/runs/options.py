@@ -29,8 +29,8 @@ class Options:
     """Make the updates while the Gymnasium environments step. The agent then acts with the weights from before the last
     updates. This makes the training faster if most of a step is waiting, for a robot or for another program."""
     share_env: bool = False
-    """Evaluate in the Gymnasium environment of the training, and not in two others, for example because there is only
-    one robot. An evaluation ends the training's episode, and then a new one begins. It needs `envs` = 1."""
+    """Evaluate in the Gymnasium environment of the training, and not in two others. So one robot is enough for a seed.
+    An evaluation ends the training's episode. It needs `envs` = 1."""
     eval_every: int = 2_000
     """Environment steps between two evaluations (Appendix B)."""
     eval_episodes: int = 5
@@ -85,7 +85,7 @@ class Options:
         check_choice(self, "overlap", (True, False))
         check_choice(self, "share_env", (True, False))
         if self.share_env and self.envs > 1:
-            raise UserError(f"share_env=True is impossible with envs={self.envs}: the training needs one environment.")
+            raise UserError(f"share_env=True is impossible with envs={self.envs}: leave one of them out.")
         if self.stop_at is not None:
             check_range(self, ("stop_at",), -LARGEST)
         if self.init_from is not None and (not isinstance(self.init_from, str) or not self.init_from):

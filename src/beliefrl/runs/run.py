@@ -7,7 +7,7 @@
                           environment failed; plain arrays, no code
     best.safetensors      the same at the evaluation with the highest return of each seed
     initial.safetensors   the networks of all seeds before the first step, if they come from another run
-    initial-replay.safetensors   the same of their replays
+    initial-replay.safetensors   the replays before the first step, if they come from another run
     results.json          the returns of the last evaluation
     curve.png             the learning curve
 

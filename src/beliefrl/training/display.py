@@ -192,7 +192,8 @@ def _origin(initial: dict[str, Any]) -> str:
     """Where the initial networks of a run come from."""
     which = "best" if initial.get("best") else "last"
     source = f"{initial.get('run')} ({initial.get('agent')} on {initial.get('task')})"
-    replay = f", and its replay (at most {taken:,} timesteps)" if (taken := initial.get("timesteps")) else ""
+    taken, step = initial.get("timesteps"), initial.get("replay_step")
+    replay = f", and its replay of step {step:,} (at most {taken:,} timesteps)" if taken and step else ""
     return f"{which} agent of {source}, commit {initial.get('git_commit')}{replay}"
 
 

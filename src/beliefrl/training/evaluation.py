@@ -237,11 +237,9 @@ def _on_host(
     run: Run,
     ended: Callable[[int], None],
 ) -> Episode:
-    with contextlib.ExitStack() as closing:
-        shared = None
-        if run.options.share_env:
-            shared = Lockstep(task, [f"seed {seed}" for seed in run.seeds])
-            closing.callback(shared.close)
-        evaluation = Evaluation(agent, task, run.seeds, "never", shared=shared)
-        closing.callback(evaluation.close)
+    shared = Lockstep(task, [f"seed {seed}" for seed in run.seeds]) if run.options.share_env else None
+    evaluation = Evaluation(agent, task, run.seeds, "never", shared=shared)
+    try:
         return evaluation.play(states, keys, episodes, ended)
+    finally:
+        evaluation.close()

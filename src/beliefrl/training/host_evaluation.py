@@ -37,7 +37,7 @@ class Evaluation:
         """
         self.agent, self.task, self.seeds = agent, task, seeds
         self._how = processes, notify, timeout
-        self.shared, self.environments = shared, shared
+        self.environments, self.is_shared = shared, shared is not None
         lanes = jax.vmap(partial(_perceive, agent, task.spec), in_axes=(None, 0, 0, 0, 0, None))
         self._perceive = jax.jit(jax.vmap(lanes, in_axes=(0, 0, 0, 0, None, None)))
 
@@ -53,11 +53,12 @@ class Evaluation:
             lanes = [f"evaluation of seed {seed}" for seed in self.seeds for _ in range(2)]
             self.environments = Lockstep(self.task, lanes, *self._how)
         keys, explore = jax.vmap(lambda key: jax.random.split(key, 2))(keys), np.array([True, False])
-        if self.shared is None:
-            return self._play(self.environments, states, keys, explore, episodes, ended)
-        sampled = self._play(self.shared, states, keys[:, :1], explore[:1], episodes, ended)
+        play = partial(self._play, self.environments, states)
+        if not self.is_shared:
+            return play(keys, explore, episodes, ended)
+        sampled = play(keys[:, :1], explore[:1], episodes, ended)
         before = sampled.done.size
-        mode = self._play(self.shared, states, keys[:, 1:], explore[1:], episodes, lambda count: ended(before + count))
+        mode = play(keys[:, 1:], explore[1:], episodes, lambda count: ended(before + count))
         return jax.tree.map(lambda *each: np.concatenate(each, axis=1), sampled, mode)
 
     def _play(
@@ -96,8 +97,8 @@ class Evaluation:
         return jax.tree.map(lambda leaf: leaf.reshape(*keys.shape, episodes), record.episodes)
 
     def close(self) -> None:
-        """Close the environments of its own, if there are any."""
-        if self.environments is not None and self.shared is None:
+        """Close the environments, if there are any."""
+        if self.environments is not None:
             self.environments.close()
 
 

@@ -56,13 +56,17 @@ def program(
     """The phases of training, with `envs` environments for each of `seeds`.
 
     `processes`, `notify` and `timeout` are those of `Lockstep`. With `overlap`, updates are made during steps. With
-    `share`, evaluations take place in the environments of the training, where a new episode begins after them.
+    `share`, evaluations take place in the environments of the training.
     """
     copies = [""] if envs == 1 else [f", environment {copy}" for copy in range(envs)]
     lanes = [f"seed {seed}{copy}" for seed in seeds for copy in copies]
     loop = HostLoop(agent, task, capacity, Lockstep(task, lanes, processes, notify, timeout), envs, overlap)
     shared = loop.environments if share else None
     evaluation = Evaluation(agent, task, seeds, processes, notify, timeout, shared)
+
+    def evaluate(states: Any, keys: Key[Array, " seed"]) -> Episode:
+        loop.is_interrupted = share
+        return evaluation.play(states, keys, episodes)
 
     def close() -> None:
         loop.close()
@@ -74,10 +78,9 @@ def program(
         pretrain=jax.jit(partial(phases.pretrain, agent), donate_argnums=0),
         refresh=jax.jit(jax.vmap(partial(phases.refresh, agent, task.spec, envs=envs)), donate_argnums=0),
         learn=loop.learn,
-        evaluate=partial(evaluation.play, episodes=episodes),
+        evaluate=evaluate,
         shapes=loop.shapes,
         revive=loop.revive,
-        **({"after_evaluation": loop.revive} if share else {}),
         close=close,
     )
 
@@ -111,6 +114,7 @@ class HostLoop:
         """`environments` has `envs` for each seed; with `overlap`, updates are made during their steps."""
         self.agent, self.spec, self.environments, self.envs = agent, task.spec, environments, envs
         self.learner = ThreadPoolExecutor(1, "learner") if overlap else None
+        self.is_interrupted = False  # whether an evaluation has used the environments since their last step
         first = phases.on_each_env(envs, lambda obs: rollout.first(agent, task.spec, (), obs))
         sizes = agent, task.spec, envs
         on_seeds = partial(jax.vmap, in_axes=(0, 0, 0, None))
@@ -151,12 +155,24 @@ class HostLoop:
         return obs.reshape(*keys.shape, -1)
 
     def revive(self, seeds: SeedState, step: int) -> SeedState:
-        """Seeds for which a new episode begins in each environment: a checkpoint has none, an evaluation used them."""
+        """Seeds in a new episode of each environment: a checkpoint has no environments, or an evaluation used them."""
         keys = jax.vmap(lambda key: step_key(key, jnp.asarray(step), REVIVE))(seeds.key)
         return seeds._replace(actor=self._first(self._reset(keys)))
 
+    def _continued(self, seeds: SeedState, step: int) -> SeedState:
+        """The seeds, in a new episode if an evaluation has interrupted the last one."""
+        if self.is_interrupted:
+            try:
+                seeds = self.revive(seeds, step)
+            except Fault as fault:
+                fault.seeds, fault.step = seeds, step
+                raise
+            self.is_interrupted = False
+        return seeds
+
     def explore(self, seeds: SeedState, first: int, steps: int) -> tuple[SeedState, Stretch]:
         """Environment steps without updates; 0 only compiles."""
+        seeds = self._continued(seeds, first) if steps else seeds
         log, output = _StretchLog(), self._act(seeds, first)
         if steps == 0:
             self._compile(seeds, output, learns=False)
@@ -168,6 +184,7 @@ class HostLoop:
 
     def learn(self, seeds: SeedState, first: int, rounds: int) -> tuple[SeedState, Stretch]:
         """`rounds` rounds of steps and updates from environment step `first` on; 0 only compiles."""
+        seeds = self._continued(seeds, first) if rounds else seeds
         log, output, length = _StretchLog(), self._act(seeds, first), round_length(self.agent, self.envs)
         if rounds == 0:
             self._compile(seeds, output, learns=True)

@@ -63,17 +63,19 @@ def taken(options: Options, agent: Agent, spec: Spec) -> tuple[dict[str, np.ndar
 
 
 def write(folder: pathlib.Path, files: dict[str, dict[str, np.ndarray]]) -> None:
-    """Write the initial arrays to files of these names in a run's folder."""
-    for name, content in files.items():
-        arrays.write_whole(folder / name, arrays.packed(content))
+    """Write the initial arrays to files of these names in a run's folder, and forget them: a replay may be large."""
+    for name in list(files):
+        arrays.write_whole(folder / name, arrays.packed(files.pop(name)))
 
 
-def started(folder: pathlib.Path, agent: Agent, seeds: SeedState) -> SeedState:
-    """The seeds of a training before its first step, with the initial arrays in a run's folder."""
+def started(folder: pathlib.Path, agent: Agent, with_replay: bool, seeds: SeedState) -> SeedState:
+    """The seeds of a training before its first step, with the initial arrays in a run's folder.
+
+    Raises:
+        UserError: a file is damaged or missing, or does not fit.
+    """
     seeds = seeds._replace(state=started_states(folder, agent, seeds.state))
-    if (folder / initial_replay.FILE).exists():
-        seeds = seeds._replace(replay=initial_replay.started(folder, seeds.replay))
-    return seeds
+    return seeds._replace(replay=initial_replay.started(folder, seeds.replay)) if with_replay else seeds
 
 
 def started_states(folder: pathlib.Path, agent: Agent, states: Any) -> Any:

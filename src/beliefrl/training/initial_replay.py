@@ -1,7 +1,7 @@
 """The replay that a training starts with, if it comes from another run (the option init_replay).
 
 Its timesteps are copied to initial-replay.safetensors in the new run's folder, in order, so the other run is not needed
-again. The networks come from the same run (`initial`), so the agent's notes on the timesteps stay right.
+again.
 """
 
 import pathlib
@@ -13,10 +13,12 @@ import numpy as np
 
 from beliefrl import tasks
 from beliefrl.agents import Agent
+from beliefrl.agents.hyperparameters import values_before
 from beliefrl.runs import arrays, segments
 from beliefrl.runs.checkpoint import stored_timesteps
 from beliefrl.runs.options import Options
 from beliefrl.runs.run import Run
+from beliefrl.runs.segments import Segment
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import rollout
 from beliefrl.training.replay import Replay
@@ -24,6 +26,7 @@ from beliefrl.types import Spec, UserError, plain
 
 FILE = "initial-replay.safetensors"
 ADDED = "added"  # the number of timesteps of each ring, among the arrays of the file
+NOTED = ("reward_memory", "store_state", "store_first_impression")  # what the agents' notes on timesteps depend on
 
 
 def taken(options: Options, agent: Agent, task: Any, seeds: list[int]) -> tuple[dict[str, np.ndarray], dict[str, int]]:
@@ -33,29 +36,33 @@ def taken(options: Options, agent: Agent, task: Any, seeds: list[int]) -> tuple[
     the seed in the other run, for each seed of this training.
 
     Raises:
-        UserError: that run was trained on another task or with other `envs`, or has no undamaged checkpoint.
+        UserError: that run was trained on another task, with other `envs` or other notes, it has no undamaged
+            checkpoint, or its timesteps are not finite.
     """
     source = Run(options.init_from or "")
-    _same(source, task, options.envs)
+    _same(source, agent, task, options.envs)
     step, files = stored_timesteps(source.folder)
-    several = () if options.envs == 1 else (options.envs,)
-    rings = len(source.seeds), *several
-    like = jax.tree.map(
-        lambda leaf: jax.ShapeDtypeStruct((*rings, _last(files), *leaf.shape), leaf.dtype), _timestep(agent, task.spec)
-    )
+    rings = (len(source.seeds),) if options.envs == 1 else (len(source.seeds), options.envs)
+    shapes = _timestep(agent, task.spec)
+    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((*rings, _room(files), *leaf.shape), leaf.dtype), shapes)
     timesteps, missing = segments.read(source.folder / "checkpoints" / "replay", like, files, len(rings))
-    count = np.array(files[-1].stop if files else np.zeros(missing.size, int)).reshape(rings) - missing
+    count = (np.array(files[-1].stop).reshape(rings) - missing)[seeds]
     kept = np.minimum(count, options.replay_capacity // options.envs)
-    newest = jax.tree.map(lambda ring: _newest(ring, count, kept)[seeds], timesteps)
-    added = {ADDED: kept[seeds].astype(np.int32)}
-    return arrays.copied(newest) | added, {"replay_step": step, "timesteps": int(kept[seeds].max(initial=0))}
+    named = jax.tree_util.tree_leaves_with_path(timesteps)
+    newest = {jax.tree_util.keystr(where): _newest(ring, seeds, count, kept) for where, ring in named}
+    if not all(np.isfinite(ring).all() for ring in newest.values()):
+        raise UserError(
+            f"init_replay is impossible: the replay of {source.folder} has numbers that are not finite, because a seed "
+            "diverged. Take other seeds, or leave init_replay out."
+        )
+    return newest | {ADDED: kept.astype(np.int32)}, {"replay_step": step, "timesteps": int(kept.max())}
 
 
 def started(folder: pathlib.Path, replay: Replay) -> Replay:
     """The first replay of a training, leaves (seed, ...), with the timesteps in a run's folder.
 
     Raises:
-        UserError: the file is damaged, or does not fit the replay.
+        UserError: the file is damaged or missing, or does not fit the replay.
     """
     path = folder / FILE
     saved, axes = arrays.load(path), replay.added.ndim
@@ -71,17 +78,18 @@ def started(folder: pathlib.Path, replay: Replay) -> Replay:
     return Replay(timesteps, jnp.asarray(saved[ADDED], replay.added.dtype))
 
 
-def _same(source: Run, task: Any, envs: int) -> None:
-    """Refuse timesteps of another task. The arguments of a Gymnasium environment may differ."""
-    asked, there = ({"faults": None} | each for each in (tasks.describe(task), source.config))
-    names = ("task", "observe", "faults", *(() if isinstance(task, GymnasiumTask) else ("constants",)))
-    asked, there = ({name: plain(each[name]) for name in names} for each in (asked, there))
-    asked["envs"], there["envs"] = envs, source.options.envs
-    for name, value in asked.items():
-        if there[name] != value:
+def _same(source: Run, agent: Agent, task: Any, envs: int) -> None:
+    """Refuse timesteps of another task, or with other notes. The arguments of a Gymnasium environment may differ."""
+    unrecorded = {"faults": None, "observe": None, **values_before(agent)}
+    there = unrecorded | source.config["hyperparameters"] | source.config | {"envs": source.options.envs}
+    here = {"faults": None, "observe": None} | tasks.describe(task) | {"envs": envs}
+    names = ("task", "observe", "faults", "envs", *(() if isinstance(task, GymnasiumTask) else ("constants",)))
+    noted = {name: getattr(agent, name) for name in NOTED if hasattr(agent, name)}
+    for name, value in ({name: here[name] for name in names} | noted).items():
+        if plain(there.get(name, value)) != plain(value):
             raise UserError(
                 f"init_replay is impossible: {source.folder} was trained with {name}={there[name]}, and this training "
-                f"has {value}."
+                f"has {value}. Use the same, or leave init_replay out."
             )
 
 
@@ -90,14 +98,16 @@ def _timestep(agent: Agent, spec: Spec) -> Any:
     return jax.eval_shape(lambda: rollout.stored(agent, rollout.first(agent, spec, (), jnp.zeros(spec.obs_dim))))
 
 
-def _last(files: list[segments.Segment]) -> int:
+def _room(files: list[Segment]) -> int:
     """Room for all timesteps that were ever added to a ring, so that `segments.read` keeps them in order."""
-    return max(files[-1].stop) if files else 1
+    return max(files[-1].stop)
 
 
-def _newest(ring: np.ndarray, count: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """The last `kept` of the `count` timesteps of each ring, (*rings, time, ...), moved to the beginning."""
-    newest = np.zeros((*ring.shape[: count.ndim], kept.max(initial=0), *ring.shape[count.ndim + 1 :]), ring.dtype)
+def _newest(rings: np.ndarray, seeds: list[int], count: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """The last `kept` of the `count` timesteps of the rings of `seeds`, (*rings, time, ...), at the beginning."""
+    axes = count.ndim
+    newest = np.zeros((*count.shape, kept.max(), *rings.shape[axes + 1 :]), rings.dtype)
     for where in np.ndindex(count.shape):
-        newest[where][: kept[where]] = ring[where][count[where] - kept[where] : count[where]]
+        ring = rings[(seeds[where[0]], *where[1:])]
+        newest[where][: kept[where]] = ring[count[where] - kept[where] : count[where]]
     return newest

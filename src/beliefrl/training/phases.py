@@ -217,7 +217,6 @@ class Program(NamedTuple):
     evaluate: Callable[..., Episode]  # states (seed, ...), keys (seed,); leaves (seed, 2, episodes)
     shapes: Callable[..., SeedState]  # keys (seed,); what `begin` gives, without its numbers
     revive: Callable[..., SeedState] = lambda seeds, step: seeds  # after they were read from a checkpoint
-    after_evaluation: Callable[..., SeedState] = lambda seeds, step: seeds  # it may have used their environments
     close: Callable[[], None] = lambda: None  # after the last phase
 
 

@@ -90,7 +90,7 @@ def stages(
     notify: Callable[[str], None] | None = None,
     own_process: bool = False,
     initial: Callable[[SeedState], SeedState] | None = None,
-    taken: int = 0,
+    taken_timesteps: int = 0,
 ) -> Generator[Event, None, None]:
     """Train; yields an Event before each long operation, and after each operation with results.
 
@@ -103,13 +103,13 @@ def stages(
         own_process: as in `train`.
         initial: given the seeds of a new training, returns them with the arrays of another run (`initial.started`).
             There is no pre-training then, because the networks of the other run have had one.
-        taken: the largest number of timesteps that a ring has from the other run.
+        taken_timesteps: the largest number of timesteps that a ring has from the other run.
 
     Raises:
         Fault: a Gymnasium environment failed. It is raised after an Event with everything learned until then.
     """
     numbers = range(options.seed, options.seed + options.seeds)
-    sizes = capacity(agent, options, taken), options.eval_episodes
+    sizes = capacity(agent, options, taken_timesteps), options.eval_episodes
     if isinstance(task, GymnasiumTask):
         yield Event(Phase.MAKING_ENVIRONMENTS, 0)
         if own_process:
@@ -153,7 +153,7 @@ def _stages(
 
     if at.evaluated // options.eval_every < at.step // options.eval_every:  # a fault came before the end of this one
         yield from _evaluation(agent, program, seeds, at.step, Phase.LEARNING)
-        seeds, at = program.after_evaluation(seeds, at.step), at._replace(evaluated=at.step)
+        at = at._replace(evaluated=at.step)
         yield Event(Phase.LEARNING, at.step, snapshot=Snapshot(at, seeds))
     if at.step < explored:
         yield Event(Phase.COMPILING_EXPLORATION, at.step)
@@ -167,7 +167,7 @@ def _stages(
         yield Event(Phase.EXPLORING, at.step, episodes=log.episodes)
         if at.step // options.eval_every > before // options.eval_every:
             yield from _evaluation(agent, program, seeds, at.step, Phase.EXPLORING)
-            seeds, at = program.after_evaluation(seeds, at.step), at._replace(evaluated=at.step)
+            at = at._replace(evaluated=at.step)
         yield Event(Phase.EXPLORING, at.step, snapshot=Snapshot(at, seeds))
 
     if at.step < options.steps and agent.pretrain_updates and not at.refreshed:
@@ -197,7 +197,7 @@ def _stages(
         yield Event(Phase.LEARNING, at.step, log.metrics, log.episodes)
         if at.step // options.eval_every > before // options.eval_every:
             yield from _evaluation(agent, program, seeds, at.step, Phase.LEARNING)
-            seeds, at = program.after_evaluation(seeds, at.step), at._replace(evaluated=at.step)
+            at = at._replace(evaluated=at.step)
         yield Event(Phase.LEARNING, at.step, snapshot=Snapshot(at, seeds))
     last = None
     if at.evaluated < at.step:
@@ -209,10 +209,10 @@ def _stages(
 ROOM = 1.25  # timesteps in the replay per step: with episodes of at least 4 steps it has the whole training
 
 
-def capacity(agent: Agent, options: Options, taken: int = 0) -> int:
+def capacity(agent: Agent, options: Options, taken_timesteps: int = 0) -> int:
     """Timesteps in the replay of each environment: one for each of its steps, and room for those that end episodes.
 
-    There is also room for `taken` timesteps from another run. If episodes are shorter than 4 steps on average, the
+    There is also room for `taken_timesteps` from another run. If episodes are shorter than 4 steps on average, the
     oldest timesteps are replaced before the training ends.
 
     Raises:
@@ -225,7 +225,9 @@ def capacity(agent: Agent, options: Options, taken: int = 0) -> int:
             f"replay_capacity={options.replay_capacity} is too small: this agent needs at least "
             f"{needed * options.envs}."
         )
-    return min(options.replay_capacity // options.envs, max(int(ROOM * steps), min(needed, 2 * steps)) + taken)
+    return min(
+        options.replay_capacity // options.envs, max(int(ROOM * steps), min(needed, 2 * steps)) + taken_timesteps
+    )
 
 
 def _processes(options: Options, own_process: bool) -> Processes:

@@ -86,10 +86,10 @@ class Session:
 
     def _train(self, restore: Callable[[SeedState], Snapshot] | None) -> None:
         try:
-            start = partial(initial.started, self.recorder.folder, self.agent) if self.given else None
-            taken = self.recorder.config.get("initial", {}).get("timesteps", 0)
-            given = self.own_process, start, taken
-            events = stages(self.agent, self.task, self.options, restore, self._note, *given)
+            files = self.recorder.folder, self.agent, self.options.init_replay
+            start = partial(initial.started, *files) if self.given else None
+            settings = self.agent, self.task, self.options, restore, self._note, self.own_process, start
+            events = stages(*settings, self.recorder.config.get("initial", {}).get("timesteps", 0))
             with self.checkpoints, self.requests, contextlib.closing(events):
                 for event in events:
                     if self.was_finished or self._listen(event):
