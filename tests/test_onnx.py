@@ -105,7 +105,7 @@ def test_the_command_compares_in_an_episode_of_the_task(tmp_path, capsys):
         np.testing.assert_allclose(theirs, ours, rtol=0, atol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_loop_on_the_page_of_examples_runs(tmp_path, monkeypatch):
     pytest.importorskip("onnx")
     task = tasks.make("gym:Pendulum-v1", observe=(0, 1))

@@ -253,7 +253,7 @@ def test_a_time_limit_needs_processes(tmp_path):
     assert _processes(Options(), own_process=True) == "auto"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_training_reports_a_slow_step(monkeypatch, tmp_path):
     monkeypatch.setattr(lockstep, "SLOW", 0.2)
     notes = []

@@ -113,7 +113,7 @@ LINE += " --checkpoint-steps 1 --resume --out"
         pytest.param("train --resume", "a log", marks=pytest.mark.nightly),
         pytest.param("train --resume", "no config", marks=pytest.mark.nightly),
         pytest.param("train", "a log", marks=pytest.mark.nightly),
-        pytest.param("python", "a log", marks=pytest.mark.slow),
+        pytest.param("python", "a log", marks=pytest.mark.nightly),
     ],
 )
 def test_a_training_that_was_killed_before_its_first_checkpoint_begins_again(whole, tmp_path, capsys, command, left):
@@ -380,7 +380,7 @@ def test_a_callback_stops_a_training_that_goes_on_to_the_last_bit(whole, tmp_pat
     assert files(run.folder) == files(whole[0])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_training_ends_where_every_seed_has_reached_the_line(whole, tmp_path):
     first = [np.mean(next(Run(whole[0]).rows(seed, "evaluation"))["sampled"]) for seed in range(2)]
     folder, notes = tmp_path / "run", []

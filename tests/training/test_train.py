@@ -152,7 +152,7 @@ assert beliefrl.evaluate(run, episodes=1, progress=False)["episodes"] == 1
         assert (tmp_path / "run" / name).read_text() == (folder / name).read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_killed_training_can_be_evaluated_and_success_is_reported(tmp_path):
     folder = tmp_path / "run"
     options = OPTIONS | {"steps": 1_000_000, "seeds": 1, "eval_every": 50}
@@ -201,10 +201,8 @@ def test_ctrl_c_ends_with_one_sentence(tmp_path):
 STEPS, ENOUGH = 4_000, -300  # a return that says that the pendulum was swung up and held
 
 
-@pytest.mark.parametrize(
-    "agent",
-    [pytest.param("predictive-sac", marks=pytest.mark.slow), pytest.param("sac-mlp", marks=pytest.mark.nightly)],
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize("agent", ["predictive-sac", "sac-mlp"])
 def test_it_learns(agent, tmp_path):
     run = tmp_path / "run"
     options = ["--steps", STEPS, "--eval-every", STEPS, "--eval-episodes", 20, "--out", run]
