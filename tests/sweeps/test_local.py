@@ -100,7 +100,7 @@ def test_a_training_has_one_thread_on_a_core_and_one_gpu_on_a_gpu(tmp_path, monk
     assert pathlib.Path(on_gpu["JAX_COMPILATION_CACHE_DIR"]).is_relative_to(tmp_path)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_sweep_is_its_trainings_and_a_failure_harms_no_other(tmp_path):
     """A seed's log is the same as that of the training alone; an environment that fails is reported at the end."""
     experiments = [
