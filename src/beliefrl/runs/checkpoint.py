@@ -206,8 +206,8 @@ def stored_timesteps(folder: pathlib.Path) -> tuple[int, list[Segment]]:
     Raises:
         UserError: there is no checkpoint, all are damaged, or the newest is from another version.
     """
-    found = sorted(listed(folder), reverse=True)
-    for path in found:
+    found = listed(folder)
+    for path in reversed(found):
         with contextlib.suppress(Damaged):
             content = checked(path)
             return content["step"], [Segment(**segment) for segment in content["replay"]]

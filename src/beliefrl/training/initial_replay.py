@@ -18,7 +18,6 @@ from beliefrl.runs import arrays, segments
 from beliefrl.runs.checkpoint import stored_timesteps
 from beliefrl.runs.options import Options
 from beliefrl.runs.run import Run
-from beliefrl.runs.segments import Segment
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import rollout
 from beliefrl.training.replay import Replay
@@ -43,8 +42,8 @@ def taken(options: Options, agent: Agent, task: Any, seeds: list[int]) -> tuple[
     _same(source, agent, task, options.envs)
     step, files = stored_timesteps(source.folder)
     rings = (len(source.seeds),) if options.envs == 1 else (len(source.seeds), options.envs)
-    shapes = _timestep(agent, task.spec)
-    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((*rings, _room(files), *leaf.shape), leaf.dtype), shapes)
+    shapes, room = _timestep(agent, task.spec), max(files[-1].stop)  # for all, so `segments.read` keeps their order
+    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((*rings, room, *leaf.shape), leaf.dtype), shapes)
     timesteps, missing = segments.read(source.folder / "checkpoints" / "replay", like, files, len(rings))
     count = (np.array(files[-1].stop).reshape(rings) - missing)[seeds]
     kept = np.minimum(count, options.replay_capacity // options.envs)
@@ -96,11 +95,6 @@ def _same(source: Run, agent: Agent, task: Any, envs: int) -> None:
 def _timestep(agent: Agent, spec: Spec) -> Any:
     """The shapes of one timestep in the replay."""
     return jax.eval_shape(lambda: rollout.stored(agent, rollout.first(agent, spec, (), jnp.zeros(spec.obs_dim))))
-
-
-def _room(files: list[Segment]) -> int:
-    """Room for all timesteps that were ever added to a ring, so that `segments.read` keeps them in order."""
-    return max(files[-1].stop)
 
 
 def _newest(rings: np.ndarray, seeds: list[int], count: np.ndarray, kept: np.ndarray) -> np.ndarray:

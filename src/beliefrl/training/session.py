@@ -86,8 +86,8 @@ class Session:
 
     def _train(self, restore: Callable[[SeedState], Snapshot] | None) -> None:
         try:
-            files = self.recorder.folder, self.agent, self.options.init_replay
-            start = partial(initial.started, *files) if self.given else None
+            initial_arrays = partial(initial.started, self.recorder.folder, self.agent, self.options.init_replay)
+            start = initial_arrays if self.given else None
             settings = self.agent, self.task, self.options, restore, self._note, self.own_process, start
             events = stages(*settings, self.recorder.config.get("initial", {}).get("timesteps", 0))
             with self.checkpoints, self.requests, contextlib.closing(events):
