@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from beliefrl.sweeps.plan import Experiment, grid
     from beliefrl.sweeps.run import SweepStatus, sweep
     from beliefrl.sweeps.tune import Tuned, tune
-    from beliefrl.tasks import Task, observe, with_faults
+    from beliefrl.tasks import Task, observe, with_action_repeat, with_faults
     from beliefrl.tasks import make as make_task
     from beliefrl.tasks.check import TaskCheck, check
     from beliefrl.tasks.environment import TaskEnvironment
@@ -86,6 +86,7 @@ __all__ = [
     "train",
     "tune",
     "video",
+    "with_action_repeat",
     "with_faults",
     "write_report",
 ]
@@ -134,6 +135,7 @@ _HOMES = {
     "train": "training.train:train",
     "tune": "sweeps.tune:tune",
     "video": "viewing.films:video",
+    "with_action_repeat": "tasks:with_action_repeat",
     "with_faults": "tasks:with_faults",
     "write_report": "report:write_report",
 }

@@ -34,7 +34,8 @@ Constants = Annotated[
     tuple[str, ...],
     tyro.conf.arg(
         metavar="NAME=VALUE",
-        help="Constants of a task's physics, or arguments of a Gymnasium environment, such as max_episode_steps=500.",
+        help="Constants of a task's physics, or arguments of a Gymnasium environment, such as max_episode_steps=500. "
+        "With action_repeat=2 each action is applied for two steps of the task.",
     ),
 ]
 

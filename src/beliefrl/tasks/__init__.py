@@ -5,7 +5,6 @@ import difflib
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
-import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl import catalogue
@@ -15,9 +14,14 @@ from beliefrl.catalogue import our_task_names as our_names
 from beliefrl.catalogue import task_names as names
 from beliefrl.imports import declared, declared_name, load, load_declared, path
 from beliefrl.tasks import registered
-from beliefrl.tasks.faults import NONE, Faults, faults_of, with_faults, without_faults
+from beliefrl.tasks.faults import NONE, Faults, Faulty, faults_of, with_faults, without_faults
 from beliefrl.tasks.gymnasium import GymnasiumTask
-from beliefrl.types import Spec, UserError, check_indices, said, short, tuples
+from beliefrl.tasks.observed import Observed, observe
+from beliefrl.tasks.observed import entries as entries
+from beliefrl.tasks.observed import entry_names as entry_names
+from beliefrl.tasks.observed import full as full
+from beliefrl.tasks.repeat import LONGEST, Repeated
+from beliefrl.types import Spec, UserError, check_whole, said, tuples
 
 
 @runtime_checkable
@@ -46,94 +50,6 @@ class Task(Protocol):
     ) -> tuple[Any, Float[Array, " obs"], Float[Array, ""], Bool[Array, ""]]:
         """Apply an action in [-1, 1]; returns the next state, its observation, the reward, and terminated."""
         ...
-
-
-@dataclasses.dataclass(frozen=True)
-class Observed:
-    """A task with only some entries of its observation (Appendix B: velocities only, no velocities)."""
-
-    task: Any
-    indices: tuple[int, ...]
-
-    @property
-    def spec(self) -> Spec:
-        return self.task.spec._replace(obs_dim=len(self.indices))
-
-    def _see(self, obs: Float[Array, " full"]) -> Float[Array, " obs"]:
-        return obs[jnp.array(self.indices)]
-
-    def reset(self, key: Key[Array, ""]) -> tuple[Any, Float[Array, " obs"]]:
-        state, obs = self.task.reset(key)
-        return state, self._see(obs)
-
-    def step(
-        self, state: Any, action: Float[Array, " action"], key: Key[Array, ""]
-    ) -> tuple[Any, Float[Array, " obs"], Float[Array, ""], Bool[Array, ""]]:
-        state, obs, reward, terminated = self.task.step(state, action, key)
-        return state, self._see(obs), reward, terminated
-
-    def measures(self, state: Any) -> dict[str, Array]:
-        return self.task.measures(state)
-
-
-def observe(task: Any, indices: tuple[int, ...]) -> Any:
-    """The same task with only the entries `indices` of its observation.
-
-    Raises:
-        UserError: an index is outside the observation or occurs twice, there is no index, or the task has faults.
-    """
-    if faults_of(task) != NONE:
-        raise UserError("The task has faults already: select the entries first, then add the faults (with_faults).")
-    if not hasattr(task, "spec"):
-        raise UserError(f"{short(task)} is no task: give one that make_task has made, or one of your own.")
-    check_indices(indices, task.spec.obs_dim)
-    if isinstance(task, GymnasiumTask):
-        seen = range(task.spec.obs_dim) if task.indices is None else task.indices
-        return dataclasses.replace(task, indices=tuple(seen[i] for i in indices))
-    if isinstance(task, Observed):  # one selection: `describe` records one
-        return Observed(task.task, tuple(task.indices[i] for i in indices))
-    return Observed(task, tuple(indices))
-
-
-def entries(task: Any) -> tuple[int, ...]:
-    """Indices of the entries that the agent sees in the task's full observation, in the agent's order.
-
-    The flag of `Faults.flicker_flag` has the index after the last one of the full observation.
-    """
-    if faults_of(task) != NONE:
-        seen = entries(without_faults(task))
-        return (*seen, full(task).spec.obs_dim) if faults_of(task).flicker_flag else seen
-    indices = getattr(task, "indices", None)
-    return tuple(range(task.spec.obs_dim)) if indices is None else tuple(indices)
-
-
-def full(task: Any) -> Any:
-    """The same task with its full observation and without faults."""
-    task = without_faults(task)
-    if isinstance(task, GymnasiumTask):
-        return dataclasses.replace(task, indices=None)
-    return task.task if isinstance(task, Observed) else task
-
-
-def entry_names(task: Any) -> tuple[str, ...]:
-    """The label of each entry that the agent sees: the task's name for it, or its index, "entry 2".
-
-    Raises:
-        UserError: the number of names differs from the number of entries.
-    """
-    if faults_of(task) != NONE:
-        inner = entry_names(without_faults(task))
-        return (*inner, "lost") if faults_of(task).flicker_flag else inner
-    if isinstance(task, Observed):
-        inner = entry_names(task.task)
-        return tuple(inner[i] for i in task.indices)
-    names = getattr(task, "entry_names", None) or [f"entry {i}" for i in entries(task)]
-    if len(names) != task.spec.obs_dim:
-        raise UserError(
-            f"{type(task).__name__} has {len(names)} entry_names for an observation of {task.spec.obs_dim}: give one "
-            "name for each entry."
-        )
-    return tuple(names)
 
 
 TASKS: dict[str, type[Any]] = {name: load(path) for name, path in catalogue.TASKS.items()}
@@ -175,6 +91,7 @@ def make(
     /,
     observe: Sequence[int | str] | int | str | None = None,
     faults: Faults | Mapping[str, Any] | None = None,
+    action_repeat: int = 1,
     **constants: Any,
 ) -> Any:
     """Make the task with a name.
@@ -188,13 +105,14 @@ def make(
             defines them. None: all entries.
         faults: missing and faulty sensors, which apply to the entries that the agent sees; also as a dictionary such as
             {"noise": 0.1}. None: no faults.
+        action_repeat: number of the task's steps for which an action is applied (`with_action_repeat`).
         constants: physical constants of the task to change, or arguments of gymnasium.make.
 
     Raises:
         UserError: there is no such task, constant or fault, a value is impossible, or `observe` or the noise does not
             fit the task.
     """
-    task = _make(name, constants)
+    task = with_action_repeat(_make(name, constants), action_repeat)
     task = task if observe is None else observed(name, task, observe)
     return with_faults(task, faults)
 
@@ -240,6 +158,34 @@ def _built(name: str, kind: type, constants: dict[str, Any]) -> Any:
         raise UserError(f"The task {name} cannot be made: {said(error)}.") from None
 
 
+def with_action_repeat(task: Any, action_repeat: int) -> Any:
+    """The same task, in which each action is applied for `action_repeat` steps, unless the episode ends before.
+
+    These are one step for the agent. It observes the last observation, and the reward is the sum of the rewards. Faults
+    apply to the agent's steps.
+
+    Raises:
+        UserError: `action_repeat` is not a whole number from 1 to 10,000.
+    """
+    check_whole("action_repeat", action_repeat, 1, LONGEST)
+    times = int(action_repeat)
+    if isinstance(task, GymnasiumTask):
+        return dataclasses.replace(task, action_repeat=times)
+    if isinstance(task, Faulty | Observed):
+        return dataclasses.replace(task, task=with_action_repeat(task.task, times))
+    task = task.task if isinstance(task, Repeated) else task
+    return task if times == 1 else Repeated(task, times)
+
+
+def action_repeat(task: Any) -> int:
+    """The number of the task's steps for which an action is applied."""
+    if isinstance(task, GymnasiumTask):
+        return task.action_repeat
+    if isinstance(task, Faulty | Observed):
+        return action_repeat(task.task)
+    return task.times if isinstance(task, Repeated) else 1
+
+
 def _similar(name: str) -> str | None:
     """The task with the most similar name; `name` may be a Gymnasium id without its prefix."""
     near = difflib.get_close_matches(name, names(), n=1)
@@ -271,12 +217,16 @@ def _indices(name: str, task: Any, observe: Sequence[int | str] | int | str) -> 
 def describe(task: Any) -> dict[str, Any]:
     """{"task": name, "constants": constants, "observe": indices}, the arguments of `make` for a task.
 
-    "observe" is None if the name implies the indices. "faults" with their settings is added if the task has any. A task
-    that `make` cannot make has the name module:Class and no constants. Nothing is imported.
+    "observe" is None if the name implies the indices. "faults" with their settings is added if the task has any. An
+    action repeat is one of the constants. A task that `make` cannot make has the name module:Class and no other
+    constants. Nothing is imported.
     """
-    faults = faults_of(task)
+    faults, repeat = faults_of(task), action_repeat(task)
     if faults != NONE:
         return describe(without_faults(task)) | {"faults": faults.settings()}
+    if repeat != 1:
+        found = describe(with_action_repeat(task, 1))
+        return found | {"constants": found["constants"] | {"action_repeat": repeat}}
     if isinstance(task, GymnasiumTask):
         return _describe_gymnasium(task)
     base, indices = (task.task, task.indices) if isinstance(task, Observed) else (task, None)

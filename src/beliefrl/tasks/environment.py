@@ -75,6 +75,8 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
             raise UserError(f"render_mode={render_mode!r} is impossible: it must be rgb_array, human or None.")
         if "max_steps" in constants:
             raise UserError("max_steps cannot be given here: use the argument max_episode_steps of gymnasium.make.")
+        if "action_repeat" in constants:  # gymnasium.make adds a time limit in the steps of its environment
+            raise UserError("action_repeat cannot be given here: make the task with it, and give the task.")
         if constants and not isinstance(task, str):
             raise UserError(f"An existing task takes no constants: make the task itself with {', '.join(constants)}.")
         self.task = tasks.make(task, **constants) if isinstance(task, str) else task
@@ -89,9 +91,10 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (spec.action_dim,), np.float32)
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (spec.obs_dim,), np.float32)
         # Pictures also show what is hidden from the agent.
-        self._drawn: Any = tasks.full(self.task)
+        self._drawn: Any = tasks.with_action_repeat(tasks.full(self.task), 1)
         if hasattr(self._drawn, "dt"):
-            self.metadata = self.metadata | {"render_fps": max(1, round(1 / self._drawn.dt))}
+            repeat = tasks.action_repeat(self.task)
+            self.metadata = self.metadata | {"render_fps": max(1, round(1 / (repeat * self._drawn.dt)))}
         self._states: list[Any] = []
         self._window: Viewer | None = None
 

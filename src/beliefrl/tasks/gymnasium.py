@@ -19,7 +19,8 @@ from gymnasium import spaces
 from beliefrl.catalogue import our_task_names
 from beliefrl.tasks.faults import NONE, STREAM, Draws, Faults
 from beliefrl.tasks.interface import Interface, interface_of, measure_of
-from beliefrl.tasks.spaces import check_actions, fits, flat_bounds, flat_size, limits
+from beliefrl.tasks.repeat import LONGEST, actions
+from beliefrl.tasks.spaces import check_actions, fits, flat_bounds, flat_size, limits, scale
 from beliefrl.types import LARGEST, Spec, UserError, as_array, check_indices, check_range, said, short
 
 ENDLESS = 10_000  # steps after which an episode without a time limit is considered endless
@@ -46,11 +47,13 @@ class GymnasiumTask:
     indices: tuple[int, ...] | None = None
     """Entries of the flat observation that the agent sees; None: all."""
     max_steps: int | None = None
-    """Time limit in steps, which truncates episodes; None: the environment's own limit."""
+    """Time limit in steps of the environment, which truncates episodes; None: the environment's own limit."""
     measures: tuple[str, ...] = ()
     """Entries of the environment's info whose last value in an episode is logged; `is_success` is "success", too."""
     faults: Faults = NONE
     """Missing and faulty sensors."""
+    action_repeat: int = 1
+    """Steps of the environment for which an action is applied; they are one step for the agent."""
 
     def __post_init__(self) -> None:
         """Set the default name. Raise a UserError for an impossible time limit, or if `make` makes no environments."""
@@ -60,6 +63,7 @@ class GymnasiumTask:
             raise UserError(f"measures={self.measures!r} is a text: give a tuple, ({self.measures!r},).")
         if self.max_steps is not None:
             check_range(self, ("max_steps",), 1)
+        check_range(self, ("action_repeat",), 1, LONGEST)
         if not self.name:
             name = getattr(self.make, "__qualname__", type(self.make).__name__)
             if name in our_task_names():  # a run would be opened with that task
@@ -143,7 +147,8 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         self.observation_space = spaces.Box(-np.inf, np.inf, (self.indices.size,), np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (self.inner_action_space.low.size,), np.float32)
         registered = getattr(self.inner, "spec", None)
-        self.limit = task.max_steps or (registered.max_episode_steps if registered else None)
+        self._longest = task.max_steps or (registered.max_episode_steps if registered else None)  # of its own steps
+        self.limit = self._longest and actions(self._longest, task.action_repeat)  # of the agent's
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -157,8 +162,17 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Apply an action in [-1, 1]."""
+        scaled = scale(self.inner_action_space, action)
+        obs, total, terminated, truncated, info = self._step(scaled)
+        for _ in range(self.task.action_repeat - 1):
+            if terminated or truncated:
+                break
+            obs, reward, terminated, truncated, info = self._step(scaled)
+            total += reward
+        return obs, total, terminated, truncated, info
+
+    def _step(self, scaled: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         self.steps, self.length = self.steps + 1, self.length + 1
-        scaled = self._scaled(action)
         result = self._call("step", lambda: self.inner.step(scaled))
         if not (isinstance(result, tuple) and len(result) == 5):
             raise self._fault("step did not return (observation, reward, terminated, truncated, info)")
@@ -166,7 +180,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         obs, reward = self._seen(obs), self._number(reward)
         terminated, truncated = self._flag(terminated, "terminated"), self._flag(truncated, "truncated")
         truncated = truncated or self.length == self.task.max_steps
-        if not (terminated or truncated) and self.length >= (self.limit or ENDLESS):
+        if not (terminated or truncated) and self.length >= (self._longest or ENDLESS):
             raise self._fault(
                 f"the episode has not ended after {self.length} steps: fix the environment, or give it a time limit "
                 "with max_episode_steps"
@@ -207,13 +221,6 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
                 f"its action space changed from {short(self.inner_action_space)} to {short(space)}, but must not change"
             )
         return result
-
-    def _scaled(self, action: np.ndarray) -> np.ndarray:
-        """The action, scaled from [-1, 1] to the bounds of the environment."""
-        space = self.inner_action_space
-        unit = np.clip(np.asarray(action, np.float64).reshape(space.shape), -1.0, 1.0) / 2 + 0.5
-        scaled = space.low + unit * (space.high.astype(np.float64) - space.low)
-        return np.clip(scaled.astype(space.dtype), space.low, space.high)  # rounding may exceed the bounds
 
     def _seen(self, obs: Any) -> np.ndarray:
         """The entries that the agent observes, as float32, after all checks."""

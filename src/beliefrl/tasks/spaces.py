@@ -127,6 +127,13 @@ def limits(space: Any, indices: Int[np.ndarray, " obs"]) -> tuple[Float[np.ndarr
     return low - margin, high + margin
 
 
+def scale(space: spaces.Box, action: Float[np.ndarray, " action"]) -> np.ndarray:
+    """The action, scaled from [-1, 1] to the bounds and the shape of the space."""
+    unit = np.clip(np.asarray(action, np.float64).reshape(space.shape), -1.0, 1.0) / 2 + 0.5
+    scaled = space.low + unit * (space.high.astype(np.float64) - space.low)
+    return np.clip(scaled.astype(space.dtype), space.low, space.high)  # rounding may exceed the bounds
+
+
 def observation_names(environment: Any, space: Any, task: str) -> tuple[str, ...]:
     """A name for each entry of the flat observation; "entry 2" for entries without a name.
 

@@ -56,18 +56,24 @@ def same(run: Run, config: dict[str, Any], older: dict[str, Any]) -> None:
 
 
 def same_task(run: Run, task: Any) -> None:
-    """Raise a UserError if a run was trained on another task, with other faults, or, in JAX, with other constants.
+    """Raise a UserError if a run was trained on another task, with other faults or another action repeat, or, in JAX,
+    with other constants.
 
     A class may be imported from another module, and the arguments of a Gymnasium environment may differ.
     """
-    asked, there = ({"faults": None} | each for each in (tasks.describe(task), run.config))
-    same = ("task", "faults") if isinstance(task, GymnasiumTask) else ("task", "faults", "constants")
+    asked, there = map(about_task, (tasks.describe(task), run.config))
+    same = ("task", "faults", "action_repeat") if isinstance(task, GymnasiumTask) else ("task", "faults", "constants")
     for name in same:
         ours, theirs = (plain(each[name]) for each in (asked, there))
         if name == "task":
             ours, theirs = (each.rpartition(":")[2] for each in (ours, theirs))
         if ours != theirs:
             raise UserError(f"{run.folder} was trained with {name}={there[name]}, not {asked[name]}: give that task.")
+
+
+def about_task(config: dict[str, Any]) -> dict[str, Any]:
+    """A run's config, or a task's description, with what it leaves out because it is usual or older."""
+    return {"faults": None, "observe": None, "action_repeat": config["constants"].get("action_repeat", 1)} | config
 
 
 def _with_functions_of(there: Any, asked: Any) -> Any:

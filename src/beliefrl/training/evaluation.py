@@ -136,7 +136,7 @@ def task_of(run: Run | str | os.PathLike[str], task: Task | GymnasiumTask | type
 
     Raises:
         UserError: there is no such run, one of its constants is impossible, it was trained on a task of your own, which
-            cannot be found by a name, or the agent observed other entries than the given task shows.
+            cannot be found by a name, or the given task shows other entries or has another action repeat.
     """
     run = run if isinstance(run, Run) else Run(run)
     if task is not None:
@@ -147,6 +147,12 @@ def task_of(run: Run | str | os.PathLike[str], task: Task | GymnasiumTask | type
                 f"{run.folder} was trained on {_entries(observed)} of the observation, and the given task shows "
                 f"{_entries(shown)}: give the same."
             )
+        trained, repeat = run.config["constants"].get("action_repeat", 1), tasks.action_repeat(made)
+        if trained != repeat:
+            raise UserError(
+                f"{run.folder} was trained with action_repeat={trained}, and the given task has {repeat}: give the "
+                "same (beliefrl.with_action_repeat)."
+            )
         return made
     name, constants = run.config["task"], tuples(run.config["constants"])
     if not tasks.knows(name):
@@ -155,7 +161,7 @@ def task_of(run: Run | str | os.PathLike[str], task: Task | GymnasiumTask | type
             "command line needs a registered name."
         )
     with _naming(run):
-        return tasks.make(name, **constants | {each: run.config.get(each) for each in ("observe", "faults")})
+        return tasks.make(name, run.config.get("observe"), run.config.get("faults"), **constants)
 
 
 def _entries(observed: list[int] | None) -> str:

@@ -20,6 +20,7 @@ from beliefrl.runs.options import Options
 from beliefrl.runs.run import Run
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import rollout
+from beliefrl.training.checks import about_task
 from beliefrl.training.replay import Replay
 from beliefrl.types import Spec, UserError, plain
 
@@ -79,10 +80,11 @@ def started(folder: pathlib.Path, replay: Replay) -> Replay:
 
 def _same(source: Run, agent: Agent, task: Any, envs: int) -> None:
     """Refuse timesteps of another task, or with other notes. The arguments of a Gymnasium environment may differ."""
-    unrecorded = {"faults": None, "observe": None, **values_before(agent)}
-    there = unrecorded | source.config["hyperparameters"] | source.config | {"envs": source.options.envs}
-    here = {"faults": None, "observe": None} | tasks.describe(task) | {"envs": envs}
-    names = ("task", "observe", "faults", "envs", *(() if isinstance(task, GymnasiumTask) else ("constants",)))
+    there = values_before(agent) | source.config["hyperparameters"]
+    there |= about_task(source.config) | {"envs": source.options.envs}
+    here = about_task(tasks.describe(task)) | {"envs": envs}
+    constants = "action_repeat" if isinstance(task, GymnasiumTask) else "constants"
+    names = ("task", "observe", "faults", "envs", constants)
     noted = {name: getattr(agent, name) for name in NOTED if hasattr(agent, name)}
     for name, value in ({name: here[name] for name in names} | noted).items():
         if plain(there.get(name, value)) != plain(value):

@@ -228,6 +228,7 @@ def pixels(environment: TaskEnvironment | Environment) -> Pixels:
 
 
 def pace_of(environment: TaskEnvironment | Environment) -> float:
-    """Steps per second of the task's simulated time."""
-    inner = environment.inner if isinstance(environment, Environment) else environment
-    return float(getattr(inner, "metadata", {}).get("render_fps") or PACE)
+    """Steps of the agent per second of the task's simulated time."""
+    on_host = isinstance(environment, Environment)
+    inner, repeat = (environment.inner, environment.task.action_repeat) if on_host else (environment, 1)
+    return float(getattr(inner, "metadata", {}).get("render_fps") or PACE) / repeat
