@@ -121,7 +121,7 @@ def test_without_faults_it_is_the_same_task():
 def test_faulty_sensors_do_not_change_the_true_episode():
     bare, faults = make("pendulum"), Faults(noise=0.1, flicker=0.5, delay=2)
     true, faulty = (compiled_episode(with_faults(bare, each), KEY, ACTIONS[:30]) for each in (Faults(), faults))
-    np.testing.assert_array_equal(faulty[1], true[1])
+    np.testing.assert_allclose(faulty[1], true[1], rtol=1e-5)  # two programs, which round differently
     assert (np.asarray(faulty[0]) != np.asarray(true[0])).any(axis=1).all()
 
 
