@@ -9,7 +9,7 @@ import pytest
 
 from beliefrl import GymnasiumTask, TaskEnvironment, cli, evaluate, play, task_of, train, with_action_repeat
 from beliefrl.runs.run import Run
-from beliefrl.tasks import action_repeat, describe, entry_names, full, make, observe
+from beliefrl.tasks import describe, entry_names, full, make, observe, steps_per_action
 from beliefrl.tasks.faults import Faults, with_faults
 from beliefrl.types import UserError
 from beliefrl.viewing.episodes import pace_of, playable
@@ -25,7 +25,7 @@ def steps(kind, count, **limits):
         environment = TaskEnvironment(task)
     else:
         ends, limit = limits.get("ends", 1000), limits.get("max_steps")
-        task = GymnasiumTask(Counter, arguments={"ends": ends}, max_steps=limit, action_repeat=3)
+        task = GymnasiumTask(Counter, arguments={"ends": ends}, max_steps=limit, steps_per_action=3)
         environment = task.environment()
     environment.reset(seed=0)
     rows = [environment.step(ZERO)[:4] for _ in range(count)]
@@ -71,33 +71,62 @@ def test_each_step_of_the_task_has_its_own_randomness():
     np.testing.assert_allclose(reward, one + two, rtol=1e-6)
 
 
+class Falling(Counter):
+    """Fails at its fifth step."""
+
+    def step(self, action):
+        if self.steps == 4:
+            raise RuntimeError("fell")
+        return super().step(action)
+
+
+def test_a_message_counts_actions():
+    environment = GymnasiumTask(Falling, max_steps=9, steps_per_action=3).environment()
+    environment.reset(seed=0)
+    environment.step(ZERO)
+    with pytest.raises(UserError, match=r"Falling \(step 2\): step raised"):
+        environment.step(ZERO)
+
+
+class Flagged(Counting):
+    """Pays True."""
+
+    def step(self, state, action, key):
+        state, obs, _, terminated = super().step(state, action, key)
+        return state, obs, jnp.array(True), terminated
+
+
+def test_rewards_are_summed_as_numbers():
+    assert with_action_repeat(Flagged(), 3).step(jnp.array(0), jnp.zeros(1), KEY)[2] == 3.0
+
+
 NAMES = ["pendulum", "pendulum-v", "gym:Pendulum-v1"]
 
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("faults", [None, Faults(noise=0.1)])
 def test_it_is_one_of_the_constants_of_a_task(name, faults):
-    task = make(name, faults=faults, action_repeat=2)
+    task = make(name, faults=faults, steps_per_action=2)
     found = describe(task)
     assert found == describe(with_action_repeat(make(name, faults=faults), 2))
-    assert found["constants"]["action_repeat"] == action_repeat(task) == 2
+    assert found["constants"]["steps_per_action"] == steps_per_action(task) == 2
     again = make(found["task"], found["observe"], found.get("faults"), **found["constants"])
     assert (describe(again), again.spec) == (found, task.spec)
-    assert "action_repeat" not in describe(with_action_repeat(task, 1))["constants"]
+    assert "steps_per_action" not in describe(with_action_repeat(task, 1))["constants"]
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_it_is_replaced_not_multiplied(name):
-    twice = make(name, action_repeat=2)
+    twice = make(name, steps_per_action=2)
     for times in (1, 3):
-        assert describe(with_action_repeat(twice, times)) == describe(make(name, action_repeat=times))
+        assert describe(with_action_repeat(twice, times)) == describe(make(name, steps_per_action=times))
 
 
 def test_entries_can_be_selected_and_have_their_names():
-    task = observe(make("pendulum", action_repeat=2), (2, 0))
-    assert task == make("pendulum", [2, 0], action_repeat=2)
+    task = observe(make("pendulum", steps_per_action=2), (2, 0))
+    assert task == make("pendulum", [2, 0], steps_per_action=2)
     assert entry_names(task) == entry_names(make("pendulum", [2, 0]))
-    assert action_repeat(full(task)) == 2
+    assert steps_per_action(full(task)) == 2
 
 
 def test_faults_apply_to_the_steps_of_the_agent():
@@ -119,7 +148,7 @@ def test_a_video_of_it_has_fewer_steps_per_second(task):
 
 
 def test_a_task_with_it_can_be_drawn():
-    true, repeated = (TaskEnvironment(make("pendulum", action_repeat=times), "rgb_array") for times in (1, 2))
+    true, repeated = (TaskEnvironment(make("pendulum", steps_per_action=times), "rgb_array") for times in (1, 2))
     for environment, count in ((true, 3), (repeated, 2)):
         environment.reset(seed=0)
         for _ in range(count - 1):
@@ -131,46 +160,52 @@ def test_a_task_with_it_can_be_drawn():
 @both
 def test_a_run_is_evaluated_and_played_with_it(kind, tmp_path):
     name = "pendulum-v" if kind == "compiled" else "gym:Pendulum-v1"
-    run = saved(tmp_path / "run", "sac-mlp", make(name, action_repeat=50))
-    assert action_repeat(task_of(run)) == 50
+    run = saved(tmp_path / "run", "sac-mlp", make(name, steps_per_action=50))
+    assert steps_per_action(task_of(run)) == 50
     played = play(run)
     assert len(played.steps.reward) == 1 + 200 // 50
     assert evaluate(run, episodes=1, progress=False)["mode"]["mean"] < -50  # the sum over 200 steps
 
 
 def test_a_task_of_ones_own_must_have_the_same(tmp_path):
-    task = GymnasiumTask(Counter, max_steps=9, action_repeat=2)
+    task = GymnasiumTask(Counter, max_steps=9, steps_per_action=2)
     run = saved(tmp_path / "run", "sac-mlp", task)
     assert len(play(run, task=task).steps.reward) == 6
-    with pytest.raises(UserError, match=r"was trained with action_repeat=2, and the given task has 1"):
+    with pytest.raises(UserError, match=r"was trained with steps_per_action=2, and the given task has 1"):
         play(run, task=Counter)
 
 
 def test_the_command_line_makes_and_shows_it(tmp_path, monkeypatch, capsys):
     given = []
     monkeypatch.setattr("beliefrl.training.train.train", lambda *args, **options: given.append(args[1]))
-    cli.main(["train", "sac-mlp", "pendulum", "--constants", "action_repeat=2", "mass=2.0"])
-    assert given == [make("pendulum", action_repeat=2, mass=2.0)]
+    cli.main(["train", "sac-mlp", "pendulum", "--constants", "steps_per_action=2", "mass=2.0"])
+    assert given == [make("pendulum", steps_per_action=2, mass=2.0)]
     run = saved(tmp_path / "run", "sac-mlp", given[0])
     cli.main(["show", str(run.folder)])
-    assert "action_repeat=2" in capsys.readouterr().out
+    assert "steps_per_action=2" in capsys.readouterr().out
 
 
 def test_a_run_does_not_go_on_with_another(tmp_path):
     run = saved(tmp_path / "run", "sac-mlp", make("pendulum"))
     with pytest.raises(UserError, match=r"was trained with constants=.*, not .*: choose another --out"):
-        train(tiny("sac-mlp"), make("pendulum", action_repeat=2), run.folder, resume=True, steps=100, seed=4)
-    assert "action_repeat" not in Run(run.folder).config["constants"]
+        train(tiny("sac-mlp"), make("pendulum", steps_per_action=2), run.folder, resume=True, steps=100, seed=4)
+    assert "steps_per_action" not in Run(run.folder).config["constants"]
 
 
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("times", [0, -1, 1.5, "two", True, 10_001])
 @pytest.mark.parametrize("name", ["pendulum-v", "gym:Pendulum-v1"])
 def test_an_impossible_number_is_a_sentence(name, times):
-    with pytest.raises(UserError, match=r"action_repeat=.* is impossible: it must be a whole number"):
-        make(name, action_repeat=times)
+    with pytest.raises(UserError, match=r"steps_per_action=.* is impossible: it must be a whole number"):
+        make(name, steps_per_action=times)
+
+
+@pytest.mark.parametrize("task", [Counter, Counting, "pendulum", None])
+def test_only_a_task_can_have_it(task):
+    with pytest.raises(UserError, match="is no task: give one that make_task has made"):
+        with_action_repeat(task, 2)
 
 
 def test_an_environment_by_name_does_not_take_it():
-    with pytest.raises(UserError, match="action_repeat cannot be given here"):
-        TaskEnvironment("pendulum", action_repeat=2)
+    with pytest.raises(UserError, match="steps_per_action cannot be given here"):
+        TaskEnvironment("pendulum", steps_per_action=2)

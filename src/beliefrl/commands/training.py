@@ -35,7 +35,7 @@ Constants = Annotated[
     tyro.conf.arg(
         metavar="NAME=VALUE",
         help="Constants of a task's physics, or arguments of a Gymnasium environment, such as max_episode_steps=500. "
-        "With action_repeat=2 each action is applied for two steps of the task.",
+        "With steps_per_action=2 each action is applied for two steps of the task.",
     ),
 ]
 

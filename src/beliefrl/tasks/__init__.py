@@ -21,7 +21,7 @@ from beliefrl.tasks.observed import entries as entries
 from beliefrl.tasks.observed import entry_names as entry_names
 from beliefrl.tasks.observed import full as full
 from beliefrl.tasks.repeat import LONGEST, Repeated
-from beliefrl.types import Spec, UserError, check_whole, said, tuples
+from beliefrl.types import Spec, UserError, check_whole, said, short, tuples
 
 
 @runtime_checkable
@@ -91,7 +91,7 @@ def make(
     /,
     observe: Sequence[int | str] | int | str | None = None,
     faults: Faults | Mapping[str, Any] | None = None,
-    action_repeat: int = 1,
+    steps_per_action: int = 1,
     **constants: Any,
 ) -> Any:
     """Make the task with a name.
@@ -105,14 +105,14 @@ def make(
             defines them. None: all entries.
         faults: missing and faulty sensors, which apply to the entries that the agent sees; also as a dictionary such as
             {"noise": 0.1}. None: no faults.
-        action_repeat: number of the task's steps for which an action is applied (`with_action_repeat`).
+        steps_per_action: number of the task's steps for which an action is applied (`with_action_repeat`).
         constants: physical constants of the task to change, or arguments of gymnasium.make.
 
     Raises:
         UserError: there is no such task, constant or fault, a value is impossible, or `observe` or the noise does not
             fit the task.
     """
-    task = with_action_repeat(_make(name, constants), action_repeat)
+    task = with_action_repeat(_make(name, constants), steps_per_action)
     task = task if observe is None else observed(name, task, observe)
     return with_faults(task, faults)
 
@@ -158,31 +158,33 @@ def _built(name: str, kind: type, constants: dict[str, Any]) -> Any:
         raise UserError(f"The task {name} cannot be made: {said(error)}.") from None
 
 
-def with_action_repeat(task: Any, action_repeat: int) -> Any:
-    """The same task, in which each action is applied for `action_repeat` steps, unless the episode ends before.
+def with_action_repeat(task: Any, steps_per_action: int) -> Any:
+    """The same task, in which each action is applied for `steps_per_action` steps, unless the episode ends before.
 
     These are one step for the agent. It observes the last observation, and the reward is the sum of the rewards. Faults
     apply to the agent's steps.
 
     Raises:
-        UserError: `action_repeat` is not a whole number from 1 to 10,000.
+        UserError: `steps_per_action` is not a whole number from 1 to 10,000, or `task` is no task.
     """
-    check_whole("action_repeat", action_repeat, 1, LONGEST)
-    times = int(action_repeat)
+    check_whole("steps_per_action", steps_per_action, 1, LONGEST)
+    times = int(steps_per_action)
     if isinstance(task, GymnasiumTask):
-        return dataclasses.replace(task, action_repeat=times)
+        return dataclasses.replace(task, steps_per_action=times)
     if isinstance(task, Faulty | Observed):
         return dataclasses.replace(task, task=with_action_repeat(task.task, times))
     task = task.task if isinstance(task, Repeated) else task
+    if isinstance(task, type) or not hasattr(task, "spec"):
+        raise UserError(f"{short(task)} is no task: give one that make_task has made, or one of your own.")
     return task if times == 1 else Repeated(task, times)
 
 
-def action_repeat(task: Any) -> int:
+def steps_per_action(task: Any) -> int:
     """The number of the task's steps for which an action is applied."""
     if isinstance(task, GymnasiumTask):
-        return task.action_repeat
+        return task.steps_per_action
     if isinstance(task, Faulty | Observed):
-        return action_repeat(task.task)
+        return steps_per_action(task.task)
     return task.times if isinstance(task, Repeated) else 1
 
 
@@ -221,12 +223,12 @@ def describe(task: Any) -> dict[str, Any]:
     action repeat is one of the constants. A task that `make` cannot make has the name module:Class and no other
     constants. Nothing is imported.
     """
-    faults, repeat = faults_of(task), action_repeat(task)
+    faults, repeat = faults_of(task), steps_per_action(task)
     if faults != NONE:
         return describe(without_faults(task)) | {"faults": faults.settings()}
     if repeat != 1:
         found = describe(with_action_repeat(task, 1))
-        return found | {"constants": found["constants"] | {"action_repeat": repeat}}
+        return found | {"constants": found["constants"] | {"steps_per_action": repeat}}
     if isinstance(task, GymnasiumTask):
         return _describe_gymnasium(task)
     base, indices = (task.task, task.indices) if isinstance(task, Observed) else (task, None)

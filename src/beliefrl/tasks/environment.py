@@ -75,8 +75,10 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
             raise UserError(f"render_mode={render_mode!r} is impossible: it must be rgb_array, human or None.")
         if "max_steps" in constants:
             raise UserError("max_steps cannot be given here: use the argument max_episode_steps of gymnasium.make.")
-        if "action_repeat" in constants:  # gymnasium.make adds a time limit in the steps of its environment
-            raise UserError("action_repeat cannot be given here: make the task with it, and give the task.")
+        if "steps_per_action" in constants:  # gymnasium.make adds a time limit, which counts actions
+            raise UserError(
+                "steps_per_action cannot be given here: use TaskEnvironment(make_task(...)), and TimeLimit."
+            )
         if constants and not isinstance(task, str):
             raise UserError(f"An existing task takes no constants: make the task itself with {', '.join(constants)}.")
         self.task = tasks.make(task, **constants) if isinstance(task, str) else task
@@ -93,7 +95,7 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         # Pictures also show what is hidden from the agent.
         self._drawn: Any = tasks.with_action_repeat(tasks.full(self.task), 1)
         if hasattr(self._drawn, "dt"):
-            repeat = tasks.action_repeat(self.task)
+            repeat = tasks.steps_per_action(self.task)
             self.metadata = self.metadata | {"render_fps": max(1, round(1 / (repeat * self._drawn.dt)))}
         self._states: list[Any] = []
         self._window: Viewer | None = None

@@ -52,7 +52,7 @@ class GymnasiumTask:
     """Entries of the environment's info whose last value in an episode is logged; `is_success` is "success", too."""
     faults: Faults = NONE
     """Missing and faulty sensors."""
-    action_repeat: int = 1
+    steps_per_action: int = 1
     """Steps of the environment for which an action is applied; they are one step for the agent."""
 
     def __post_init__(self) -> None:
@@ -63,7 +63,7 @@ class GymnasiumTask:
             raise UserError(f"measures={self.measures!r} is a text: give a tuple, ({self.measures!r},).")
         if self.max_steps is not None:
             check_range(self, ("max_steps",), 1)
-        check_range(self, ("action_repeat",), 1, LONGEST)
+        check_range(self, ("steps_per_action",), 1, LONGEST)
         if not self.name:
             name = getattr(self.make, "__qualname__", type(self.make).__name__)
             if name in our_task_names():  # a run would be opened with that task
@@ -132,7 +132,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
     def __init__(self, task: GymnasiumTask, seed: str = ""):
         """Make the environment and check its spaces."""
         self.task, self.seed = task, seed
-        self.steps, self.length = 0, 0  # in total, and in this episode
+        self.steps, self.length = 0, 0  # actions in total, and steps of the environment in this episode
         self._measured: dict[str, float] = {}  # in this episode
         self.inner = task.bare()
         self.inner_action_space: Any = getattr(self.inner, "action_space", None)
@@ -148,7 +148,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         self.action_space = spaces.Box(-1.0, 1.0, (self.inner_action_space.low.size,), np.float32)
         registered = getattr(self.inner, "spec", None)
         self._longest = task.max_steps or (registered.max_episode_steps if registered else None)  # of its own steps
-        self.limit = self._longest and actions(self._longest, task.action_repeat)  # of the agent's
+        self.limit = self._longest and actions(self._longest, task.steps_per_action)  # of the agent's
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -162,9 +162,9 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Apply an action in [-1, 1]."""
-        scaled = scale(self.inner_action_space, action)
+        self.steps, scaled = self.steps + 1, scale(self.inner_action_space, action)
         obs, total, terminated, truncated, info = self._step(scaled)
-        for _ in range(self.task.action_repeat - 1):
+        for _ in range(self.task.steps_per_action - 1):
             if terminated or truncated:
                 break
             obs, reward, terminated, truncated, info = self._step(scaled)
@@ -172,7 +172,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         return obs, total, terminated, truncated, info
 
     def _step(self, scaled: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        self.steps, self.length = self.steps + 1, self.length + 1
+        self.length += 1
         result = self._call("step", lambda: self.inner.step(scaled))
         if not (isinstance(result, tuple) and len(result) == 5):
             raise self._fault("step did not return (observation, reward, terminated, truncated, info)")

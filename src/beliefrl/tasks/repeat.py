@@ -44,12 +44,16 @@ class Repeated:
         self, state: Any, action: Float[Array, " action"], key: Key[Array, ""]
     ) -> tuple[Any, Float[Array, " obs"], Float[Array, ""], Bool[Array, ""]]:
         """The last observation, and the sum of the rewards. After a terminal step nothing changes."""
-        keys = jax.random.split(key, self.times)
+
+        def once(state: Any, key: Key[Array, ""]) -> Any:
+            state, obs, reward, terminated = self.task.step(state, action, key)
+            return state, obs, jnp.asarray(reward, float), terminated
 
         def again(now: Any, key: Key[Array, ""]) -> tuple[Any, None]:
             state, _, total, terminated = now
-            state, obs, reward, ends = self.task.step(state, action, key)
+            state, obs, reward, ends = once(state, key)
             after = state, obs, total + reward, ends
             return jax.tree.map(lambda old, new: jnp.where(terminated, old, new), now, after), None
 
-        return jax.lax.scan(again, self.task.step(state, action, keys[0]), keys[1:])[0]
+        keys = jax.random.split(key, self.times)
+        return jax.lax.scan(again, once(state, keys[0]), keys[1:])[0]

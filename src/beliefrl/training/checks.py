@@ -62,7 +62,9 @@ def same_task(run: Run, task: Any) -> None:
     A class may be imported from another module, and the arguments of a Gymnasium environment may differ.
     """
     asked, there = map(about_task, (tasks.describe(task), run.config))
-    same = ("task", "faults", "action_repeat") if isinstance(task, GymnasiumTask) else ("task", "faults", "constants")
+    same = (
+        ("task", "faults", "steps_per_action") if isinstance(task, GymnasiumTask) else ("task", "faults", "constants")
+    )
     for name in same:
         ours, theirs = (plain(each[name]) for each in (asked, there))
         if name == "task":
@@ -73,7 +75,11 @@ def same_task(run: Run, task: Any) -> None:
 
 def about_task(config: dict[str, Any]) -> dict[str, Any]:
     """A run's config, or a task's description, with what it leaves out because it is usual or older."""
-    return {"faults": None, "observe": None, "action_repeat": config["constants"].get("action_repeat", 1)} | config
+    return {
+        "faults": None,
+        "observe": None,
+        "steps_per_action": config["constants"].get("steps_per_action", 1),
+    } | config
 
 
 def _with_functions_of(there: Any, asked: Any) -> Any:

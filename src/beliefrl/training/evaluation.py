@@ -147,10 +147,10 @@ def task_of(run: Run | str | os.PathLike[str], task: Task | GymnasiumTask | type
                 f"{run.folder} was trained on {_entries(observed)} of the observation, and the given task shows "
                 f"{_entries(shown)}: give the same."
             )
-        trained, repeat = run.config["constants"].get("action_repeat", 1), tasks.action_repeat(made)
+        trained, repeat = run.config["constants"].get("steps_per_action", 1), tasks.steps_per_action(made)
         if trained != repeat:
             raise UserError(
-                f"{run.folder} was trained with action_repeat={trained}, and the given task has {repeat}: give the "
+                f"{run.folder} was trained with steps_per_action={trained}, and the given task has {repeat}: give the "
                 "same (beliefrl.with_action_repeat)."
             )
         return made

@@ -83,7 +83,7 @@ def _same(source: Run, agent: Agent, task: Any, envs: int) -> None:
     there = values_before(agent) | source.config["hyperparameters"]
     there |= about_task(source.config) | {"envs": source.options.envs}
     here = about_task(tasks.describe(task)) | {"envs": envs}
-    constants = "action_repeat" if isinstance(task, GymnasiumTask) else "constants"
+    constants = "steps_per_action" if isinstance(task, GymnasiumTask) else "constants"
     names = ("task", "observe", "faults", "envs", constants)
     noted = {name: getattr(agent, name) for name in NOTED if hasattr(agent, name)}
     for name, value in ({name: here[name] for name in names} | noted).items():

@@ -228,7 +228,8 @@ def pixels(environment: TaskEnvironment | Environment) -> Pixels:
 
 
 def pace_of(environment: TaskEnvironment | Environment) -> float:
-    """Steps of the agent per second of the task's simulated time."""
+    """Steps of the agent per second of the task's simulated time; PACE if the duration of a step is not known."""
     on_host = isinstance(environment, Environment)
-    inner, repeat = (environment.inner, environment.task.action_repeat) if on_host else (environment, 1)
-    return float(getattr(inner, "metadata", {}).get("render_fps") or PACE) / repeat
+    inner, repeat = (environment.inner, environment.task.steps_per_action) if on_host else (environment, 1)
+    pace = getattr(inner, "metadata", {}).get("render_fps")
+    return float(pace) / repeat if pace else PACE
