@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from safetensors.numpy import save_file
 
 from beliefrl.analysis import aggregate, panels
 from beliefrl.analysis.figures import curve_figure, draw_curve, standard_error
-from beliefrl.analysis.groups import groups
+from beliefrl.analysis.groups import Curve, groups
 from beliefrl.analysis.panels import dashes
 from beliefrl.analysis.tables import (
     COSTS,
@@ -366,6 +367,13 @@ def test_a_curve_draws_each_measure_with_its_actions_and_names_the_task(tmp_path
         means = {line.get_label(): line.get_ydata().tolist() for line in axis.lines if "actions" in line.get_label()}
         assert means == {"sampled actions": sampled, "mode actions": mode}
     assert returns.get_title(loc="left") == "vrm on pendulum-v observe 0 noise=0.3, mean and S.E.M. of 2 seeds"
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_single_evaluation_can_be_seen(count):
+    axis = Figure().subplots()
+    panels.draw_line(axis, Curve(np.arange(count), np.ones((3, count))), "black", "vrm")
+    assert (axis.lines[0].get_marker() == "o") == (count == 1)
 
 
 def test_agents_without_a_model_have_no_such_figure(two_tasks, tmp_path):

@@ -99,9 +99,10 @@ def panels(count: int, labels: Sequence[str]) -> tuple[Any, list[Any]]:
 
 
 def draw_line(axis: Any, curve: Curve, colour: str, label: str, **style: Any) -> None:
-    """Draw the mean of a curve over its seeds, and its S.E.M. as a band."""
+    """Draw the mean of a curve over its seeds, and its S.E.M. as a band; a single evaluation is a dot."""
     mean, error = np.nanmean(curve.seeds, axis=0), standard_error(curve.seeds)
-    axis.plot(curve.steps, mean, color=colour, linewidth=1.6, label=label, **style)
+    marker = "o" if len(curve.steps) == 1 else ""
+    axis.plot(curve.steps, mean, color=colour, linewidth=1.6, marker=marker, markersize=4, label=label, **style)
     axis.fill_between(curve.steps, mean - error, mean + error, color=colour, alpha=0.2, linewidth=0)
 
 
