@@ -9,7 +9,7 @@ import tempfile
 # Most of a test's time is compilation. So little is optimised, and what one test has compiled the next ones read, and
 # the programs that they start; a folder for each of pytest's processes, as JAX does not write its files in one piece.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
-# Without these, programs run more slowly and compile in half the time. XLA ends the process at a flag it does not know.
+# Without XLA's fusion emitters programs compile in half the time, and run more slowly. An unknown flag ends a process.
 if importlib.metadata.version("jaxlib").startswith(("0.10.", "0.11.")):
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
 # BELIEFRL_TEST_CACHE names a folder that stays, for tests that run again and again in one process at a time.

@@ -10,6 +10,14 @@ class UserError(Exception):
     """A mistake that the user can fix. Its message is one sentence: what was wrong, and what to do."""
 
 
+class Fault(UserError):
+    """An environment misbehaved. The message names the environment, the seed and the step."""
+
+    seeds: Any = None  # of a training: the seeds as trained until then (`host_loop`)
+    step: int = 0
+    stretch: Any = None
+
+
 def cause(error: OSError) -> str:
     """The operating system's reason for an error, or else the error's own text."""
     return error.strerror or one_line(str(error))

@@ -12,8 +12,9 @@ import pytest
 from gymnasium import spaces
 
 from beliefrl import catalogue, tasks
+from beliefrl.errors import Fault
 from beliefrl.tasks import gymnasium as adapter
-from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
+from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.interface import Interface
 from beliefrl.training.lockstep import Lockstep
 from beliefrl.types import UserError

@@ -14,9 +14,10 @@ import pytest
 from gymnasium import spaces
 
 from beliefrl import agents, cli, evaluate, load, resume, tasks, train
+from beliefrl.errors import Fault
 from beliefrl.runs.options import Options
 from beliefrl.runs.run import Run
-from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
+from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.pendulum import Pendulum, PendulumState
 from beliefrl.training import host_loop, initial, lockstep, phases, session
 from beliefrl.training.lockstep import Lockstep

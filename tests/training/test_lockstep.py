@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from beliefrl import UserError, agents, resume, tasks, train
-from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
+from beliefrl.errors import Fault
+from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import host_loop, lockstep, phases, rounds, schedule
 from beliefrl.training import replay as ring
 from beliefrl.training.lockstep import Lockstep

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from beliefrl import agents, resume, train
-from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
+from beliefrl.errors import Fault
+from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import host_loop
 from beliefrl.training.host_loop import HostLoop
 from beliefrl.training.rounds import round_length

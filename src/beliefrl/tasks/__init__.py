@@ -161,8 +161,8 @@ def _built(name: str, kind: type, constants: dict[str, Any]) -> Any:
 def with_action_repeat(task: Any, steps_per_action: int) -> Any:
     """The same task, in which each action is applied for `steps_per_action` steps, unless the episode ends before.
 
-    These are one step for the agent. It observes the last observation, and the reward is the sum of the rewards. Faults
-    apply to the agent's steps.
+    For the agent they are one step. It observes the last observation, and its reward is the sum of their rewards.
+    Faults apply to the agent's steps.
 
     Raises:
         UserError: `steps_per_action` is not a whole number from 1 to 10,000, or `task` is no task.

@@ -77,7 +77,7 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
             raise UserError("max_steps cannot be given here: use the argument max_episode_steps of gymnasium.make.")
         if "steps_per_action" in constants:  # gymnasium.make adds a time limit, which counts actions
             raise UserError(
-                "steps_per_action cannot be given here: use TaskEnvironment(make_task(...)), and TimeLimit."
+                "steps_per_action cannot be given here: give it to make_task, and the task to TaskEnvironment."
             )
         if constants and not isinstance(task, str):
             raise UserError(f"An existing task takes no constants: make the task itself with {', '.join(constants)}.")

@@ -17,6 +17,7 @@ import numpy as np
 from gymnasium import spaces
 
 from beliefrl.catalogue import our_task_names
+from beliefrl.errors import Fault
 from beliefrl.tasks.faults import NONE, STREAM, Draws, Faults
 from beliefrl.tasks.interface import Interface, interface_of, measure_of
 from beliefrl.tasks.repeat import LONGEST, actions
@@ -24,14 +25,6 @@ from beliefrl.tasks.spaces import check_actions, fits, flat_bounds, flat_size, l
 from beliefrl.types import LARGEST, Spec, UserError, as_array, check_indices, check_range, said, short
 
 ENDLESS = 10_000  # steps after which an episode without a time limit is considered endless
-
-
-class Fault(UserError):
-    """An environment misbehaved. The message names the environment, the seed and the step."""
-
-    seeds: Any = None  # of a training: the seeds as trained until then (`host_loop`)
-    step: int = 0
-    stretch: Any = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -53,7 +46,7 @@ class GymnasiumTask:
     faults: Faults = NONE
     """Missing and faulty sensors."""
     steps_per_action: int = 1
-    """Steps of the environment for which an action is applied; they are one step for the agent."""
+    """Steps of the environment for which an action is applied. For the agent they are one step."""
 
     def __post_init__(self) -> None:
         """Set the default name. Raise a UserError for an impossible time limit, or if `make` makes no environments."""

@@ -9,11 +9,11 @@ from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.types import Spec
 
-LONGEST = 10_000  # steps
+LONGEST = 10_000  # steps of a task for an action
 
 
 def actions(steps: int, times: int) -> int:
-    """How many actions take at least this many steps."""
+    """The number of actions for `steps` steps of a task, rounded up."""
     return -(-steps // times)
 
 

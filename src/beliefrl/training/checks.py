@@ -62,10 +62,7 @@ def same_task(run: Run, task: Any) -> None:
     A class may be imported from another module, and the arguments of a Gymnasium environment may differ.
     """
     asked, there = map(about_task, (tasks.describe(task), run.config))
-    same = (
-        ("task", "faults", "steps_per_action") if isinstance(task, GymnasiumTask) else ("task", "faults", "constants")
-    )
-    for name in same:
+    for name in decisive(task):
         ours, theirs = (plain(each[name]) for each in (asked, there))
         if name == "task":
             ours, theirs = (each.rpartition(":")[2] for each in (ours, theirs))
@@ -74,12 +71,14 @@ def same_task(run: Run, task: Any) -> None:
 
 
 def about_task(config: dict[str, Any]) -> dict[str, Any]:
-    """A run's config, or a task's description, with what it leaves out because it is usual or older."""
-    return {
-        "faults": None,
-        "observe": None,
-        "steps_per_action": config["constants"].get("steps_per_action", 1),
-    } | config
+    """A run's config, or the description of a task, with the settings that are recorded only if they are unusual."""
+    repeat = config["constants"].get("steps_per_action", 1)
+    return {"faults": None, "observe": None, "steps_per_action": repeat} | config
+
+
+def decisive(task: Any) -> tuple[str, ...]:
+    """Names in `about_task` that must agree for two tasks to be the same, apart from the observed entries."""
+    return "task", "faults", "steps_per_action" if isinstance(task, GymnasiumTask) else "constants"
 
 
 def _with_functions_of(there: Any, asked: Any) -> Any:

@@ -17,6 +17,7 @@ from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.given import given
 from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.training.checks import about_task
 from beliefrl.training.compilation import keep_compiled
 from beliefrl.training.host_evaluation import Evaluation
 from beliefrl.training.lockstep import Lockstep
@@ -140,18 +141,17 @@ def task_of(run: Run | str | os.PathLike[str], task: Task | GymnasiumTask | type
     """
     run = run if isinstance(run, Run) else Run(run)
     if task is not None:
-        made, observed = given(task), run.config.get("observe")
-        shown = tasks.describe(made)["observe"]
-        if shown != observed:
+        made = given(task)
+        asked, there = map(about_task, (tasks.describe(made), run.config))
+        if asked["observe"] != there["observe"]:
             raise UserError(
-                f"{run.folder} was trained on {_entries(observed)} of the observation, and the given task shows "
-                f"{_entries(shown)}: give the same."
+                f"{run.folder} was trained on {_entries(there['observe'])} of the observation, and the given task "
+                f"shows {_entries(asked['observe'])}: give the same."
             )
-        trained, repeat = run.config["constants"].get("steps_per_action", 1), tasks.steps_per_action(made)
-        if trained != repeat:
+        if asked["steps_per_action"] != there["steps_per_action"]:
             raise UserError(
-                f"{run.folder} was trained with steps_per_action={trained}, and the given task has {repeat}: give the "
-                "same (beliefrl.with_action_repeat)."
+                f"{run.folder} was trained with steps_per_action={there['steps_per_action']}, and the given task has "
+                f"{asked['steps_per_action']}: give the same (beliefrl.with_action_repeat)."
             )
         return made
     name, constants = run.config["task"], tuples(run.config["constants"])

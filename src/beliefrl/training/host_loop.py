@@ -29,7 +29,8 @@ import numpy as np
 from jaxtyping import Array, Key
 
 from beliefrl.agents import Agent
-from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
+from beliefrl.errors import Fault
+from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import host_steps, phases, rollout
 from beliefrl.training.host_evaluation import Evaluation
 from beliefrl.training.host_steps import ActorOutput, StepResult

@@ -18,9 +18,8 @@ from beliefrl.runs import arrays, segments
 from beliefrl.runs.checkpoint import stored_timesteps
 from beliefrl.runs.options import Options
 from beliefrl.runs.run import Run
-from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import rollout
-from beliefrl.training.checks import about_task
+from beliefrl.training.checks import about_task, decisive
 from beliefrl.training.replay import Replay
 from beliefrl.types import Spec, UserError, plain
 
@@ -83,8 +82,7 @@ def _same(source: Run, agent: Agent, task: Any, envs: int) -> None:
     there = values_before(agent) | source.config["hyperparameters"]
     there |= about_task(source.config) | {"envs": source.options.envs}
     here = about_task(tasks.describe(task)) | {"envs": envs}
-    constants = "steps_per_action" if isinstance(task, GymnasiumTask) else "constants"
-    names = ("task", "observe", "faults", "envs", constants)
+    names = (*decisive(task), "observe", "envs")
     noted = {name: getattr(agent, name) for name in NOTED if hasattr(agent, name)}
     for name, value in ({name: here[name] for name in names} | noted).items():
         if plain(there.get(name, value)) != plain(value):

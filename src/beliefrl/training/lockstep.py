@@ -20,7 +20,8 @@ from gymnasium import logger
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from beliefrl.tasks.gymnasium import Environment, Fault, GymnasiumTask
+from beliefrl.errors import Fault
+from beliefrl.tasks.gymnasium import Environment, GymnasiumTask
 from beliefrl.training.stop import SIGNALS
 from beliefrl.types import UserError
 

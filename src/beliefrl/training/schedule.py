@@ -13,9 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from beliefrl.agents import Agent
+from beliefrl.errors import Fault
 from beliefrl.runs.options import Options, Processes
 from beliefrl.tasks import Task
-from beliefrl.tasks.gymnasium import Fault, GymnasiumTask
+from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import host_loop, keys, phases
 from beliefrl.training.phases import Program, SeedState
 from beliefrl.training.rollout import Episode
