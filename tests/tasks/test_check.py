@@ -165,8 +165,8 @@ def test_composite_observations_are_named_by_their_keys():
     assert tasks.entry_names(GymnasiumTask(Dictionary, indices=(4, 0))) == ("b = 2", "a 0")
 
 
-@pytest.mark.parametrize("names", [("one", "two", "three"), 5, None])
-def test_names_that_do_not_fit_are_ignored(names):
+@pytest.mark.parametrize("names", [5, None, (1, 2, 3)])
+def test_what_is_no_list_of_names_is_ignored(names):
     assert GymnasiumTask(spaced(entry_names=names)).entry_names == ("entry 0", "entry 1")
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from beliefrl import tasks
-from beliefrl.tasks import TASKS, entry_names, make, names, observe
+from beliefrl.tasks import TASKS, describe, entry_names, make, names, observe, with_action_repeat, with_faults
 from beliefrl.tasks.given import given
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.pendulum import Pendulum
@@ -280,13 +280,21 @@ def test_a_class_of_environments_is_a_task():
     ("wrong", "phrase"),
     [
         (Fine(), "Fine is given as one environment, but several are needed: give its class"),
-        (Pendulum, "is no task: give the name of a task, a task, or a class of Gymnasium environments"),
+        (Pendulum, "is no task: give one that make_task has made, one of your own, or a class of Gym"),
         (None, "None is no task"),
     ],
 )
 def test_what_is_no_task_is_refused(wrong, phrase):
     with pytest.raises(UserError, match=phrase):
         given(wrong)
+
+
+def test_a_class_of_environments_can_be_changed_as_it_is():
+    task = GymnasiumTask(Fine)
+    for change, argument in ((observe, (1,)), (with_faults, {"noise": 0.1}), (with_action_repeat, 2)):
+        assert describe(change(Fine, argument)) == describe(change(task, argument))
+        with pytest.raises(UserError, match="Fine is given as one environment, but several are needed: give its class"):
+            change(Fine(), argument)
 
 
 @pytest.mark.parametrize("make", [Fine(), "gym:Pendulum-v1"])

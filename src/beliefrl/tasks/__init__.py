@@ -14,14 +14,14 @@ from beliefrl.catalogue import our_task_names as our_names
 from beliefrl.catalogue import task_names as names
 from beliefrl.imports import declared, declared_name, load, load_declared, path
 from beliefrl.tasks import registered
-from beliefrl.tasks.faults import NONE, Faults, Faulty, faults_of, with_faults, without_faults
+from beliefrl.tasks.faults import NONE, Faults, faults_of, without_faults
 from beliefrl.tasks.gymnasium import GymnasiumTask
-from beliefrl.tasks.observed import Observed, observe
+from beliefrl.tasks.observed import Observed
 from beliefrl.tasks.observed import entries as entries
 from beliefrl.tasks.observed import entry_names as entry_names
 from beliefrl.tasks.observed import full as full
-from beliefrl.tasks.repeat import LONGEST, Repeated
-from beliefrl.types import Spec, UserError, check_whole, said, short, tuples
+from beliefrl.tasks.variants import observe, steps_per_action, with_action_repeat, with_faults
+from beliefrl.types import Spec, UserError, said, tuples
 
 
 @runtime_checkable
@@ -156,36 +156,6 @@ def _built(name: str, kind: type, constants: dict[str, Any]) -> Any:
         if name in TASKS:
             raise
         raise UserError(f"The task {name} cannot be made: {said(error)}.") from None
-
-
-def with_action_repeat(task: Any, steps_per_action: int) -> Any:
-    """The same task, in which each action is applied for `steps_per_action` steps, unless the episode ends before.
-
-    For the agent they are one step. It observes the last observation, and its reward is the sum of their rewards.
-    Faults apply to the agent's steps.
-
-    Raises:
-        UserError: `steps_per_action` is not a whole number from 1 to 10,000, or `task` is no task.
-    """
-    check_whole("steps_per_action", steps_per_action, 1, LONGEST)
-    times = int(steps_per_action)
-    if isinstance(task, GymnasiumTask):
-        return dataclasses.replace(task, steps_per_action=times)
-    if isinstance(task, Faulty | Observed):
-        return dataclasses.replace(task, task=with_action_repeat(task.task, times))
-    task = task.task if isinstance(task, Repeated) else task
-    if isinstance(task, type) or not hasattr(task, "spec"):
-        raise UserError(f"{short(task)} is no task: give one that make_task has made, or one of your own.")
-    return task if times == 1 else Repeated(task, times)
-
-
-def steps_per_action(task: Any) -> int:
-    """The number of the task's steps for which an action is applied."""
-    if isinstance(task, GymnasiumTask):
-        return task.steps_per_action
-    if isinstance(task, Faulty | Observed):
-        return steps_per_action(task.task)
-    return task.times if isinstance(task, Repeated) else 1
 
 
 def _similar(name: str) -> str | None:

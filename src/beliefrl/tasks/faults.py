@@ -193,34 +193,18 @@ class Faulty:
         )
 
 
-def with_faults(task: Any, faults: Faults | Mapping[str, Any] | None) -> Any:
-    """The same task with missing and faulty sensors; without any faults, the task itself.
-
-    `faults` may also be a dictionary, such as {"noise": 0.1}.
-
-    Raises:
-        UserError: the task has faults already, there is no such fault, or the noise does not fit its observation.
-    """
-    faults = Faults.of(faults)
-    if faults == NONE:
-        return task
-    if faults_of(task) != NONE:
-        raise UserError("The task has faults already: give all faults at once.")
-    return Faulty(task, faults) if _is_bare(task) else dataclasses.replace(task, faults=faults)
-
-
 def faults_of(task: Any) -> Faults:
     """The faults of a task, by default none."""
-    return NONE if _is_bare(task) else task.faults
+    return NONE if is_bare(task) else task.faults
 
 
 def without_faults(task: Any) -> Any:
     """The same task without its faults."""
     if isinstance(task, Faulty):
         return task.task
-    return task if _is_bare(task) else dataclasses.replace(task, faults=NONE)
+    return task if is_bare(task) else dataclasses.replace(task, faults=NONE)
 
 
-def _is_bare(task: Any) -> bool:
+def is_bare(task: Any) -> bool:
     """Whether a task has no field for faults: it is neither a Faulty nor a GymnasiumTask."""
     return not isinstance(getattr(task, "faults", None), Faults)

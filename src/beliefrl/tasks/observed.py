@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.tasks.faults import NONE, faults_of, without_faults
 from beliefrl.tasks.gymnasium import GymnasiumTask
-from beliefrl.types import Spec, UserError, check_indices, short
+from beliefrl.types import Spec, UserError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,25 +37,6 @@ class Observed:
 
     def measures(self, state: Any) -> dict[str, Array]:
         return self.task.measures(state)
-
-
-def observe(task: Any, indices: tuple[int, ...]) -> Any:
-    """The same task with only the entries `indices` of its observation.
-
-    Raises:
-        UserError: an index is outside the observation or occurs twice, there is no index, or the task has faults.
-    """
-    if faults_of(task) != NONE:
-        raise UserError("The task has faults already: select the entries first, then add the faults (with_faults).")
-    if not hasattr(task, "spec"):
-        raise UserError(f"{short(task)} is no task: give one that make_task has made, or one of your own.")
-    check_indices(indices, task.spec.obs_dim)
-    if isinstance(task, GymnasiumTask):
-        seen = range(task.spec.obs_dim) if task.indices is None else task.indices
-        return dataclasses.replace(task, indices=tuple(seen[i] for i in indices))
-    if isinstance(task, Observed):  # one selection: `describe` records one
-        return Observed(task.task, tuple(task.indices[i] for i in indices))
-    return Observed(task, tuple(indices))
 
 
 def entries(task: Any) -> tuple[int, ...]:

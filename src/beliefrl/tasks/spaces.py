@@ -141,11 +141,20 @@ def observation_names(environment: Any, space: Any, task: str) -> tuple[str, ...
         environment: the Gymnasium environment.
         space: its observation space, which must be supported.
         task: name of the task, such as "gym:Pendulum-v1".
+
+    Raises:
+        UserError: the environment has `entry_names`, but not one for each entry.
     """
     size, bare = spaces.flatdim(space), getattr(environment, "unwrapped", environment)
+    own = getattr(bare, "entry_names", None)
+    if isinstance(own, list | tuple | np.ndarray) and all(isinstance(name, str) for name in own):
+        if len(own) != size:
+            raise UserError(
+                f"{task} has {len(own)} entry_names for an observation of {size}: give one name for each entry."
+            )
+        return tuple(map(str, own))
     known = KNOWN.get(task.removeprefix(PREFIX))
     sources: tuple[Callable[[], Any], ...] = (
-        lambda: bare.entry_names,
         lambda: _of_mujoco(bare),
         lambda: _of_walker(bare),
         lambda: known.names if known else (),

@@ -1,0 +1,100 @@
+"""The same task with fewer entries of its observation, with faults, or with an action repeat."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+
+from beliefrl.tasks.faults import NONE, Faults, Faulty, faults_of, is_bare
+from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.tasks.observed import Observed
+from beliefrl.tasks.repeat import LONGEST, Repeated
+from beliefrl.types import UserError, check_indices, check_whole, short
+
+
+def as_task(task: Any) -> Any:
+    """The task itself, or one that makes environments of this Gymnasium class.
+
+    Raises:
+        UserError: it is an environment, another class, or no task at all.
+    """
+    if isinstance(task, type) and issubclass(task, gymnasium.Env):
+        return GymnasiumTask(task)
+    if isinstance(task, gymnasium.Env):
+        kind = type(task).__name__
+        raise UserError(f"{kind} is given as one environment, but several are needed: give its class.")
+    if isinstance(task, GymnasiumTask):  # its spec would make an environment
+        return task
+    if isinstance(task, type) or not hasattr(task, "spec"):
+        raise UserError(
+            f"{short(task)} is no task: give one that make_task has made, one of your own, or a class of Gymnasium "
+            "environments."
+        )
+    return task
+
+
+def observe(task: Any, indices: tuple[int, ...]) -> Any:
+    """The same task with only the entries `indices` of its observation.
+
+    `task` may also be a class of Gymnasium environments.
+
+    Raises:
+        UserError: an index is outside the observation or occurs twice, there is no index, the task has faults, or
+            `task` is no task.
+    """
+    task = as_task(task)
+    if faults_of(task) != NONE:
+        raise UserError("The task has faults already: select the entries first, then add the faults (with_faults).")
+    check_indices(indices, task.spec.obs_dim)
+    if isinstance(task, GymnasiumTask):
+        seen = range(task.spec.obs_dim) if task.indices is None else task.indices
+        return dataclasses.replace(task, indices=tuple(seen[i] for i in indices))
+    if isinstance(task, Observed):  # one selection: `describe` records one
+        return Observed(task.task, tuple(task.indices[i] for i in indices))
+    return Observed(task, tuple(indices))
+
+
+def with_faults(task: Any, faults: Faults | Mapping[str, Any] | None) -> Any:
+    """The same task with missing and faulty sensors; without any faults, the task itself.
+
+    `task` may also be a class of Gymnasium environments, and `faults` a dictionary, such as {"noise": 0.1}.
+
+    Raises:
+        UserError: the task has faults already, there is no such fault, the noise does not fit its observation, or
+            `task` is no task.
+    """
+    task, faults = as_task(task), Faults.of(faults)
+    if faults == NONE:
+        return task
+    if faults_of(task) != NONE:
+        raise UserError("The task has faults already: give all faults at once.")
+    return Faulty(task, faults) if is_bare(task) else dataclasses.replace(task, faults=faults)
+
+
+def with_action_repeat(task: Any, steps_per_action: int) -> Any:
+    """The same task, in which each action is applied for `steps_per_action` steps, unless the episode ends before.
+
+    For the agent they are one step. It observes the last observation, and its reward is the sum of their rewards.
+    Faults apply to the agent's steps. `task` may also be a class of Gymnasium environments.
+
+    Raises:
+        UserError: `steps_per_action` is not a whole number from 1 to 10,000, or `task` is no task.
+    """
+    check_whole("steps_per_action", steps_per_action, 1, LONGEST)
+    task, times = as_task(task), int(steps_per_action)
+    if isinstance(task, GymnasiumTask):
+        return dataclasses.replace(task, steps_per_action=times)
+    if isinstance(task, Faulty | Observed):
+        return dataclasses.replace(task, task=with_action_repeat(task.task, times))
+    task = task.task if isinstance(task, Repeated) else task
+    return task if times == 1 else Repeated(task, times)
+
+
+def steps_per_action(task: Any) -> int:
+    """The number of the task's steps for which an action is applied."""
+    if isinstance(task, GymnasiumTask):
+        return task.steps_per_action
+    if isinstance(task, Faulty | Observed):
+        return steps_per_action(task.task)
+    return task.times if isinstance(task, Repeated) else 1
