@@ -27,6 +27,8 @@ from beliefrl.sweeps import sources
 from beliefrl.types import UserError
 from inputs import HOUR, TWO_SEEDS, a_run, flat
 
+TWICE = {"steps_per_action": 2}
+
 
 def with_success(seeds):
     """The same evaluations, with success in the first of two episodes."""
@@ -341,6 +343,14 @@ def test_a_seed_without_updates_does_not_hide_the_loss_of_the_others(tmp_path):
     ]
     (group,) = groups(runs)
     np.testing.assert_array_equal(panels.model_loss(group).seeds, [[8.0, 6.0], [np.nan, np.nan]])
+
+
+@pytest.mark.parametrize(("constants", "label"), [({}, "environment steps"), (TWICE, "steps of the agent")])
+def test_the_axis_says_whose_steps_are_counted(tmp_path, monkeypatch, constants, label):
+    run, drawn = a_run(tmp_path, TWO_SEEDS, constants=constants), []
+    monkeypatch.setattr(panels, "save", lambda made, out: drawn.append(made) or out)
+    panels.draw_curves(groups([run]), tmp_path / "curves")
+    assert [axis.get_xlabel() for made in (*drawn, curve_figure(run)) for axis in made.axes] == [label] * 2
 
 
 def test_a_bar_has_the_label_of_its_agent_and_a_profile_falls(tmp_path, monkeypatch):

@@ -76,6 +76,9 @@ def test_a_run_older_than_a_setting_has_what_it_had_in_effect_where_that_is_know
     ]
 
 
+TWICE = ("pendulum-v steps_per_action=2", "steps of the agent")
+
+
 def test_constants_of_a_task_set_it_apart_from_the_same_task_only(tmp_path):
     made = [
         a_run(tmp_path / "a", [flat(1.0)], constants={"length": 1.0}),
@@ -83,6 +86,15 @@ def test_constants_of_a_task_set_it_apart_from_the_same_task_only(tmp_path):
         a_run(tmp_path / "c", [flat(1.0)], task="cartpole", constants={"track": 2.4}),
     ]
     assert [group.task for group in groups(made)] == ["pendulum-v length=1.0", "pendulum-v length=2.0", "cartpole"]
+
+
+def test_action_repeat_is_named_with_the_task_and_its_steps_are_those_of_the_agent(tmp_path):
+    once, twice = [
+        a_run(tmp_path / str(times), [flat(1.0)], constants={"length": 1.0, "steps_per_action": times})
+        for times in (1, 2)
+    ]
+    assert [(group.task, group.axis) for group in groups([twice])] == [TWICE]
+    assert [(group.task, group.axis) for group in groups([once, twice])] == [("pendulum-v", "environment steps"), TWICE]
 
 
 def test_a_seed_run_twice_counts_once_as_far_as_it_went(tmp_path):

@@ -86,7 +86,7 @@ def standard_error(seeds: np.ndarray) -> np.ndarray:
 
 
 def draw_curve(run: Run | str | os.PathLike[str], path: str | os.PathLike[str] | None = None) -> pathlib.Path:
-    """Draw a run's evaluation returns over environment steps; returns the path of the picture.
+    """Draw a run's evaluation returns over its steps; returns the path of the picture.
 
     Each measure of the task, such as success, has another panel. Each seed is a thin line, the mean a thick
     line, and the S.E.M. a band.
@@ -127,7 +127,7 @@ def curve_figure(run: Run) -> Any:
                 axis.plot(steps, seed, color=colour, linewidth=0.6, alpha=0.4)
             axis.plot(steps, mean, color=colour, linewidth=2, label=f"{mode} actions", marker="o", markersize=3)
             axis.fill_between(steps, mean - error, mean + error, color=colour, alpha=0.2, linewidth=0)
-        axis.set_xlabel("environment steps")
+        axis.set_xlabel(group.axis)
         axis.set_ylabel(axis_label(measure))
         axis.grid(alpha=0.25)
         axis.spines[["top", "right"]].set_visible(False)

@@ -43,6 +43,11 @@ class Group:
     def agent(self) -> str:
         return self.seeds[0][0].config["agent"]
 
+    @property
+    def axis(self) -> str:
+        """The label of the axis of steps. With action repeat a step of the agent is several of the environment."""
+        return "environment steps" if _steps_per_action(self.runs[0]) == 1 else "steps of the agent"
+
     @cached_property
     def evaluations(self) -> list[list[Row]]:
         """The evaluations of each seed, in the order of `seeds`."""
@@ -192,11 +197,17 @@ def _precedence(run: Run, seed: int) -> tuple[int, str]:
 
 
 def task_of(run: Run) -> str:
-    """The name of a task in figures. It includes the observed entries, if the run has selected some, and the faults."""
+    """The name of a task in figures, with the observed entries if the run has selected some, faults, action repeat."""
     seen = run.config.get("observe")
     observed = ["observe", *map(str, seen)] if seen else []
     faults = [f"{name}={value}" for name, value in run.config.get("faults", {}).items()]
-    return " ".join([run.config["task"], *observed, *faults])
+    times = _steps_per_action(run)
+    repeat = [] if times == 1 else [f"steps_per_action={times}"]
+    return " ".join([run.config["task"], *observed, *faults, *repeat])
+
+
+def _steps_per_action(run: Run) -> int:
+    return run.config["constants"].get("steps_per_action", 1)
 
 
 def _differences(settings: Row, others: Sequence[Row]) -> list[str]:

@@ -38,8 +38,7 @@ OTHERS = ("#777777", "#8f8f1f", "#3c8fc0", "#b37700", "#5e4fa2", "#0f8b8d")
 
 
 def draw_curves(groups: Sequence[Group], out: pathlib.Path, mode: str = "sampled") -> pathlib.Path:
-    """Draw returns over environment steps, mean and S.E.M. over seeds. Each measure of a task, such as
-    success, has another panel.
+    """Draw returns over steps, mean and S.E.M. over seeds. Each measure of a task, such as success, has another panel.
 
     Args:
         groups: the lines; groups of the same task share a panel.
@@ -61,11 +60,11 @@ def draw_curves(groups: Sequence[Group], out: pathlib.Path, mode: str = "sampled
     style = {label: DASHES[number % len(DASHES)] for label, number in dashes(labels).items()}
     made, axes = panels(len(entries), labels)
     for axis, (task, measure) in zip(axes, entries, strict=True):
-        for group in groups:
-            if group.task == task and (not measure or measure in group.measures):
-                label, name = group.label, f"{mode}_{measure}" if measure else mode
-                draw_line(axis, group.curve(name), colour[label], label, linestyle=style[label])
-        finish(axis, task, axis_label(measure))
+        shown = [group for group in groups if group.task == task and (not measure or measure in group.measures)]
+        for group in shown:
+            label, name = group.label, f"{mode}_{measure}" if measure else mode
+            draw_line(axis, group.curve(name), colour[label], label, linestyle=style[label])
+        finish(axis, task, shown[0].axis, axis_label(measure))
     add_legend(made, {label: colour[label] for label in labels}, spread(groups), style)
     return save(made, out)
 
@@ -106,10 +105,10 @@ def draw_line(axis: Any, curve: Curve, colour: str, label: str, **style: Any) ->
     axis.fill_between(curve.steps, mean - error, mean + error, color=colour, alpha=0.2, linewidth=0)
 
 
-def finish(axis: Any, title: str, ordinate: str) -> None:
+def finish(axis: Any, title: str, abscissa: str, ordinate: str) -> None:
     """Add the title, the labels and the grid."""
     axis.set_title(title, fontsize=10)
-    axis.set_xlabel("environment steps", fontsize=9)
+    axis.set_xlabel(abscissa, fontsize=9)
     axis.set_ylabel(ordinate, fontsize=9)
     axis.tick_params(labelsize=8)
     axis.xaxis.set_major_formatter(thousands)
@@ -272,7 +271,7 @@ def draw_elbo(groups: Sequence[Group], out: pathlib.Path, mode: str = "sampled")
     made, axes = panels(len(shown), [*lines])
     for axis, (group, loss) in zip(axes, shown, strict=True):
         draw_line(axis, group.curve(mode), colour[group.label], "return")
-        finish(axis, f"{group.label} on {group.task}", "return")
+        finish(axis, f"{group.label} on {group.task}", group.axis, "return")
         right = axis.twinx()
         draw_line(right, loss, GREY, "loss of the model", linestyle="--")
         right.set_ylabel(dashed, fontsize=9)

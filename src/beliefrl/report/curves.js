@@ -82,6 +82,7 @@ class Panel {
   constructor(task) {
     this.task = task;
     this.groups = data.groups.filter((group) => group.task === task);
+    this.abscissa = this.groups[0].axis; // with action repeat: steps of the agent
     this.tip = html("div", { class: "tip", role: "status" });
     this.plot = svg("svg", {
       tabindex: 0,
@@ -124,7 +125,7 @@ class Panel {
     this.plot.setAttribute("viewBox", `0 0 ${this.width} ${HEIGHT}`);
     const entry = this.view.rate ? "success rate" : "return";
     const names = this.lines.map(({ label }) => label).join(", ");
-    this.plot.setAttribute("aria-label", `${entry} over environment steps on ${this.task}: ${names}`);
+    this.plot.setAttribute("aria-label", `${entry} over ${this.abscissa} on ${this.task}: ${names}`);
     this.plot.replaceChildren(
       ...this.axes(low - room, high + room, last, entry),
       ...this.lines.map((line) => this.line(line)),
@@ -161,7 +162,7 @@ class Panel {
       svg(
         "text",
         { class: "name", x: (left + right) / 2, y: HEIGHT - 3, "text-anchor": "middle" },
-        "environment steps",
+        this.abscissa,
       ),
       svg(
         "text",

@@ -79,6 +79,7 @@ def _group(group: Group) -> dict[str, Any]:
     return {
         "task": group.task,
         "label": group.label,
+        "axis": group.axis,
         "seeds": [seed for _, seed in group.seeds],
         "diverged": diverged,
         "unfinished": not all(map(is_finished, group.runs)),
