@@ -11,7 +11,7 @@ MISTAKES = {
     "make_task('pendulum', observe=1.5)": "observe=1.5 cannot be understood",
     "make_task('pendulum', faults=0.1)": "faults=0.1 is impossible: give Faults(...), or a dictionary of its fields.",
     "with_faults(make_task('pendulum'), {'nose': 0.1})": "There is no fault 'nose'",
-    "with_faults(5, {'noise': 0.1})": "5 is no task: give one that make_task has made",
+    "with_faults(5, {'noise': 0.1})": "5 is no task: give a task (make_task makes one from its name)",
     "observe('pendulum', (1,))": "'pendulum' is no task",
     "observe(make_task('pendulum'), 1)": "observe=1 is not a list of indices: give a tuple, such as (0, 1).",
     "observe(make_task('pendulum'), 'velocities')": "observe='velocities' is not a list of indices",

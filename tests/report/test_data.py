@@ -27,6 +27,7 @@ def test_numbers_are_those_of_the_metrics(tmp_path):
     a_folder(tmp_path / "run", TWO_SEEDS)
     (group,) = page_data(tmp_path)["groups"]
     assert (group["task"], group["label"], group["seeds"], group["steps"]) == ("pendulum-v", "vrm", [0, 1], 20)
+    assert group["axis"] == "environment steps"
     curve = group["curves"]["sampled"]
     assert curve["steps"] == [10, 20]
     assert curve["seeds"] == [[1.5, 4.0], [1.5, 7.0]]
@@ -141,6 +142,13 @@ def test_videos_and_curves_are_linked_from_where_the_page_lies(tmp_path):
     page = write_report([tmp_path], tmp_path / "pages" / "page.html").read_text()
     addresses = re.findall(r'"address":"(.*?)"', page)
     assert addresses == [f"../runs/a%20run/{name}" for name in ("curve.png", "videos/seed%200.mp4", "x.gif")]
+
+
+def test_action_repeat_is_named_wherever_the_task_is(tmp_path):
+    a_folder(tmp_path / "run", TWO_SEEDS, constants={"steps_per_action": 2})
+    page = page_data(tmp_path)
+    assert {each["task"] for each in (*page["groups"], *page["runs"])} == {"pendulum-v steps_per_action=2"}
+    assert page["groups"][0]["axis"] == "steps of the agent"
 
 
 def test_text_of_runs_cannot_become_html(tmp_path):

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.wrappers import TimeAwareObservation, TimeLimit
 
 import beliefrl
 from beliefrl import cli, tasks
@@ -165,9 +166,39 @@ def test_composite_observations_are_named_by_their_keys():
     assert tasks.entry_names(GymnasiumTask(Dictionary, indices=(4, 0))) == ("b = 2", "a 0")
 
 
-@pytest.mark.parametrize("names", [5, None, (1, 2, 3)])
+@pytest.mark.parametrize("names", [5, None, "angle", ()])
 def test_what_is_no_list_of_names_is_ignored(names):
     assert GymnasiumTask(spaced(entry_names=names)).entry_names == ("entry 0", "entry 1")
+
+
+@pytest.mark.parametrize("names", [("one", 2), np.array(["one", "2"]), {"one": 0.5, "2": 0.5}.keys()])
+def test_names_may_be_of_any_kind(names):
+    assert GymnasiumTask(spaced(entry_names=names)).entry_names == ("one", "2")
+
+
+def test_a_wrong_number_of_names_is_refused_and_the_entries_are_shown():
+    found = beliefrl.check(GymnasiumTask(spaced(entry_names=("angle",)), "robot"))
+    assert found.refusals == ("robot has 1 entry_names for an observation of 2: give one name for each entry.",)
+    assert [entry.name for entry in found.entries] == ["entry 0", "entry 1"]
+
+
+def test_a_wrapper_may_change_the_observation_and_name_its_entries():
+    class Named(TimeAwareObservation):
+        entry_names = ("angle", "speed", "time")
+
+    inner = spaced(entry_names=("angle", "speed"))
+    for wrapper, names in ((TimeAwareObservation, ("entry 0", "entry 1", "entry 2")), (Named, Named.entry_names)):
+        task = GymnasiumTask(lambda wrapper=wrapper: wrapper(TimeLimit(inner(), 9)))
+        assert task.entry_names == names
+
+
+def test_names_that_cannot_be_read_are_ignored():
+    class Broken(Fine):
+        @property
+        def entry_names(self):
+            raise RuntimeError("not before reset")
+
+    assert GymnasiumTask(Broken).entry_names == ("entry 0", "entry 1")
 
 
 def test_the_robots_entries_have_the_names_of_their_joints():

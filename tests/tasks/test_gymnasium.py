@@ -78,14 +78,6 @@ def test_the_interface_has_the_entries_that_the_agent_sees_and_the_bounds_of_its
     assert GymnasiumTask(Fine).interface.entries == ("entry 0", "entry 1")
 
 
-def test_names_of_entries_must_be_as_many_as_the_entries():
-    class Misnamed(Fine):
-        entry_names = ("angle",)
-
-    with pytest.raises(UserError, match="Misnamed has 1 entry_names for an observation of 2: give one name for each"):
-        _ = GymnasiumTask(Misnamed).spec
-
-
 def test_discrete_values_of_any_type_of_number_are_observed():
     for space, given, expected in (
         (spaces.Discrete(2), np.bool_(True), [0, 1]),

@@ -20,6 +20,7 @@ from beliefrl.types import UserError
 
 COLUMNS = 3
 PANEL = (3.5, 2.7)  # inches
+TITLE = 44  # letters in a line of a panel's title
 HANDLE, LETTER = 0.6, 0.072  # inches: of a legend entry without its label, of a letter
 DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (7, 2, 1.5, 2)), (0, (3, 1, 1, 1, 1, 1)))  # lengths in line widths
 AGENTS = {  # colours
@@ -107,7 +108,7 @@ def draw_line(axis: Any, curve: Curve, colour: str, label: str, **style: Any) ->
 
 def finish(axis: Any, title: str, abscissa: str, ordinate: str) -> None:
     """Add the title, the labels and the grid."""
-    axis.set_title(title, fontsize=10)
+    axis.set_title(textwrap.fill(title, TITLE, break_on_hyphens=False), fontsize=10)
     axis.set_xlabel(abscissa, fontsize=9)
     axis.set_ylabel(ordinate, fontsize=9)
     axis.tick_params(labelsize=8)

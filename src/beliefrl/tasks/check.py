@@ -16,7 +16,7 @@ from beliefrl import tasks
 from beliefrl.tasks.environment import TaskEnvironment
 from beliefrl.tasks.given import given
 from beliefrl.tasks.gymnasium import ENDLESS, GymnasiumTask
-from beliefrl.tasks.spaces import action_names, check_actions, flat_bounds, flat_size, observation_names
+from beliefrl.tasks.spaces import action_names, check_actions, check_names, flat_bounds, flat_size, observation_names
 from beliefrl.types import LARGEST, UserError, check_whole, short
 
 SCALES = 100.0  # entries whose largest magnitudes differ by more than this factor cause a warning
@@ -129,7 +129,7 @@ def check(
 
 
 def _declared(task: Any) -> TaskCheck:
-    """The declarations of a task. If its spaces are not supported: the refusals, and no entries."""
+    """The declarations of a task, and the refusals. If its spaces are not supported: no entries."""
     if not isinstance(task, GymnasiumTask):
         spec, names = task.spec, tasks.entry_names(tasks.full(task))
         entries = tuple(Entry(index, name, -np.inf, np.inf) for index, name in enumerate(names))
@@ -144,6 +144,7 @@ def _declared(task: Any) -> TaskCheck:
         bounds, wanted = flat_bounds(space), flat_bounds(actions)
         names = observation_names(environment, space, task.name), action_names(environment, wanted.low.size)
         found = dataclasses.replace(found, entries=_entries(names[0], bounds), actions=_entries(names[1], wanted))
+        refusals = _refusals(lambda: check_names(environment, space, task.name))
     with contextlib.suppress(Exception):
         environment.close()
     return dataclasses.replace(found, refusals=refusals)

@@ -69,8 +69,8 @@ class GymnasiumTask:
         with contextlib.chdir(os.curdir):  # an environment may change both
             environment = self.environment()
         jax.config.update("jax_enable_x64", wide)
-        interface = interface_of(environment, self.name)
-        environment.close()
+        with contextlib.closing(environment):
+            interface = interface_of(environment, self.name)
         size = self.faults.observed_size(environment.indices.size)
         return Spec(size, len(interface.low), environment.limit or LARGEST, self.measures), interface
 

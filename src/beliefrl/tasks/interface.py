@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from beliefrl.errors import UserError, short
-from beliefrl.tasks.spaces import observation_names
+from beliefrl.tasks.spaces import check_names, observation_names
 
 UNNAMED = "entry "
 
@@ -40,7 +40,12 @@ class Interface(NamedTuple):
 
 
 def interface_of(environment: Any, task: str) -> Interface:
-    """The interface of an `Environment`; `task` is the name of its task."""
+    """The interface of an `Environment`; `task` is the name of its task.
+
+    Raises:
+        UserError: the environment has names for its entries, but not one for each.
+    """
+    check_names(environment.inner, environment.inner_observation_space, task)
     names = observation_names(environment.inner, environment.inner_observation_space, task)
     actions = environment.inner_action_space
     seen = tuple(names[index] for index in environment.indices)

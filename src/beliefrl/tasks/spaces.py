@@ -1,8 +1,8 @@
 """The Gymnasium spaces that are supported, their flat observations, and the names of entries.
 
-Names come from these sources, in this order: an attribute `entry_names` of the environment; MuJoCo's model, for
-environments that have an `observation_structure` (version 5); the joints of PyBullet's robots; the catalogue; the keys
-of Dict and Tuple spaces. A unit follows a name in brackets.
+Names come from these sources, in this order: an attribute `entry_names` of the environment or of a wrapper; MuJoCo's
+model, for environments that have an `observation_structure` (version 5); the joints of PyBullet's robots; the
+catalogue; the keys of Dict and Tuple spaces. A unit follows a name in brackets.
 """
 
 import contextlib
@@ -141,20 +141,11 @@ def observation_names(environment: Any, space: Any, task: str) -> tuple[str, ...
         environment: the Gymnasium environment.
         space: its observation space, which must be supported.
         task: name of the task, such as "gym:Pendulum-v1".
-
-    Raises:
-        UserError: the environment has `entry_names`, but not one for each entry.
     """
     size, bare = spaces.flatdim(space), getattr(environment, "unwrapped", environment)
-    own = getattr(bare, "entry_names", None)
-    if isinstance(own, list | tuple | np.ndarray) and all(isinstance(name, str) for name in own):
-        if len(own) != size:
-            raise UserError(
-                f"{task} has {len(own)} entry_names for an observation of {size}: give one name for each entry."
-            )
-        return tuple(map(str, own))
     known = KNOWN.get(task.removeprefix(PREFIX))
     sources: tuple[Callable[[], Any], ...] = (
+        lambda: _own_names(environment),
         lambda: _of_mujoco(bare),
         lambda: _of_walker(bare),
         lambda: known.names if known else (),
@@ -166,6 +157,29 @@ def observation_names(environment: Any, space: Any, task: str) -> tuple[str, ...
             if len(names) == size:
                 return names
     return tuple(f"entry {index}" for index in range(size))
+
+
+def check_names(environment: Any, space: Any, name: str) -> None:
+    """Raise a UserError if the environment `name` has `entry_names`, but not one for each entry of its observation.
+
+    A wrapper that changes the observation leaves the names of the environment in it, so they are ignored there.
+    """
+    size, names = spaces.flatdim(space), _own_names(environment)
+    changed = True
+    with contextlib.suppress(Exception):
+        changed = spaces.flatdim(environment.unwrapped.observation_space) != size
+    if names and len(names) != size and not changed:
+        raise UserError(
+            f"{name} has {len(names)} entry_names for an observation of {size}: give one name for each entry."
+        )
+
+
+def _own_names(environment: Any) -> tuple[str, ...]:
+    """The attribute `entry_names` of the outermost wrapper that has it, or of the environment; () without it."""
+    with contextlib.suppress(Exception):  # it may be anything
+        names = environment.get_wrapper_attr("entry_names")
+        return () if isinstance(names, str) else tuple(map(str, names))
+    return ()
 
 
 def action_names(environment: Any, size: int) -> tuple[str, ...]:

@@ -28,8 +28,8 @@ def as_task(task: Any) -> Any:
         return task
     if isinstance(task, type) or not hasattr(task, "spec"):
         raise UserError(
-            f"{short(task)} is no task: give one that make_task has made, one of your own, or a class of Gymnasium "
-            "environments."
+            f"{short(task)} is no task: give a task (make_task makes one from its name), a GymnasiumTask, or a class "
+            "of Gymnasium environments."
         )
     return task
 
