@@ -280,7 +280,7 @@ def test_a_class_of_environments_is_a_task():
     ("wrong", "phrase"),
     [
         (Fine(), "Fine is given as one environment, but several are needed: give its class"),
-        (Pendulum, "is no task: give a task .make_task makes one from its name., a GymnasiumTask, or a class"),
+        (Pendulum, r"is no task: give a task \(make_task makes one from its name\), a GymnasiumTask, or a class"),
         (None, "None is no task"),
     ],
 )

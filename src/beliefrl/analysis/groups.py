@@ -10,6 +10,7 @@ import numpy as np
 
 from beliefrl.analysis import results
 from beliefrl.runs.options import Options
+from beliefrl.runs.records import steps_per_action
 from beliefrl.runs.run import Row, Run
 from beliefrl.types import UserError
 
@@ -46,7 +47,7 @@ class Group:
     @property
     def axis(self) -> str:
         """The label of the axis of steps. With action repeat a step of the agent is several of the environment."""
-        return "environment steps" if _steps_per_action(self.runs[0]) == 1 else "steps of the agent"
+        return "environment steps" if steps_per_action(self.runs[0].config) == 1 else "steps of the agent"
 
     @cached_property
     def evaluations(self) -> list[list[Row]]:
@@ -197,17 +198,13 @@ def _precedence(run: Run, seed: int) -> tuple[int, str]:
 
 
 def task_of(run: Run) -> str:
-    """The name of a task in figures, with the observed entries if the run has selected some, faults, action repeat."""
+    """The name of a task in figures. It includes selected entries, faults and action repeat, if there are any."""
     seen = run.config.get("observe")
     observed = ["observe", *map(str, seen)] if seen else []
     faults = [f"{name}={value}" for name, value in run.config.get("faults", {}).items()]
-    times = _steps_per_action(run)
+    times = steps_per_action(run.config)
     repeat = [] if times == 1 else [f"steps_per_action={times}"]
     return " ".join([run.config["task"], *observed, *faults, *repeat])
-
-
-def _steps_per_action(run: Run) -> int:
-    return run.config["constants"].get("steps_per_action", 1)
 
 
 def _differences(settings: Row, others: Sequence[Row]) -> list[str]:

@@ -53,6 +53,11 @@ def is_complete(config: Any) -> bool:
     return isinstance(resumed, list) and all(map(_is_session, [config, *resumed]))
 
 
+def steps_per_action(config: Row) -> int:
+    """The action repeat in config.json, which is one of the task's constants if it is not 1."""
+    return config["constants"].get("steps_per_action", 1)
+
+
 def _is_session(session: Any) -> bool:
     """Whether the value can be a record of `provenance`."""
     if not isinstance(session, dict):

@@ -162,13 +162,12 @@ def observation_names(environment: Any, space: Any, task: str) -> tuple[str, ...
 def check_names(environment: Any, space: Any, name: str) -> None:
     """Raise a UserError if the environment `name` has `entry_names`, but not one for each entry of its observation.
 
-    A wrapper that changes the observation leaves the names of the environment in it, so they are ignored there.
+    If a wrapper has changed the size of the observation, the names of the environment do not fit, and are ignored.
     """
-    size, names = spaces.flatdim(space), _own_names(environment)
-    changed = True
+    size, names, inside = spaces.flatdim(space), _own_names(environment), None
     with contextlib.suppress(Exception):
-        changed = spaces.flatdim(environment.unwrapped.observation_space) != size
-    if names and len(names) != size and not changed:
+        inside = spaces.flatdim(environment.unwrapped.observation_space)
+    if names and len(names) != size == inside:
         raise UserError(
             f"{name} has {len(names)} entry_names for an observation of {size}: give one name for each entry."
         )

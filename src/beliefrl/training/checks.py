@@ -5,6 +5,7 @@ from typing import Any
 
 from beliefrl import tasks
 from beliefrl.runs import trackers
+from beliefrl.runs.records import steps_per_action
 from beliefrl.runs.run import Run
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.schedule import Options
@@ -72,8 +73,7 @@ def same_task(run: Run, task: Any) -> None:
 
 def about_task(config: dict[str, Any]) -> dict[str, Any]:
     """A run's config, or the description of a task, with the settings that are recorded only if they are unusual."""
-    repeat = config["constants"].get("steps_per_action", 1)
-    return {"faults": None, "observe": None, "steps_per_action": repeat} | config
+    return {"faults": None, "observe": None, "steps_per_action": steps_per_action(config)} | config
 
 
 def decisive(task: Any) -> tuple[str, ...]:
