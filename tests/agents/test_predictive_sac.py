@@ -26,6 +26,7 @@ AGENT = PredictiveSACAgent(
     batch_size=16,
     pool=3,
     reward_memory=(2.0, 10.0),
+    observation_memory=(3.0, 20.0),
 )
 TIME = 7  # timesteps of a window
 
@@ -35,14 +36,20 @@ def noted(window, excess=lambda reward: reward):
 
     `excess` is u. The policy that acted is a standard normal before the tanh.
     """
-    before, notes = jnp.zeros((window.step.reward.shape[1], 2)), []
-    for t in range(len(window.step.reward)):
-        u = jnp.where(window.step.is_first[t], 0.0, excess(window.step.reward[t]))[:, None]
-        before = jnp.where(window.step.is_first[t][:, None], 0.0, before)
-        before = before * (1 - 1 / jnp.array([[2.0, 10.0]])) + u
-        notes.append(before)
-    zeros = jnp.zeros_like(window.step.prev_action)
-    return read(window._replace(note=Note(jnp.stack(notes), Policy(zeros, zeros))), continues=False)
+    step, zeros = window.step, jnp.zeros_like(window.step.prev_action)
+    u = jnp.where(step.is_first, 0.0, excess(step.reward))
+    rewards, observations = sums(step.is_first, u, (2.0, 10.0)), sums(step.is_first, step.obs, (3.0, 20.0))
+    return read(window._replace(note=Note(rewards, Policy(zeros, zeros), observations)), continues=False)
+
+
+def sums(is_first, values, constants):
+    """Decaying sums of values (time, batch, ...) since the last first timestep, with a last axis of time constants."""
+    total, found = np.zeros((*values.shape[1:], len(constants))), []
+    for t in range(len(values)):
+        begins = np.asarray(is_first[t]).reshape(-1, *[1] * (total.ndim - 1))
+        total = np.where(begins, 0.0, total) * (1 - 1 / np.array(constants)) + np.asarray(values[t])[..., None]
+        found.append(total)
+    return jnp.array(found)
 
 
 def read(window, continues, reader=None):
@@ -54,7 +61,8 @@ def read(window, continues, reader=None):
 
 def unrolled(state, window, start=None):
     """The LSTM's states along a window, from zero by default."""
-    inputs = state.scales.model_input(state.scales.perception(window.step), window.note.rewards)
+    x = state.scales.perception(window.step, window.note.observations)
+    inputs = state.scales.model_input(x, window.note.rewards)
     start = state.model.lstm.start(window.step.reward.shape[1]) if start is None else start
     return jax.jit(lambda: state.model.lstm.unroll(start, inputs, window.step.is_first))()
 
@@ -87,7 +95,9 @@ def test_acting_forms_the_belief_that_replay_forms(state):
         now = jax.tree.map(lambda leaf, t=t: leaf[t, 0], step)
         memory = AGENT.reset(SPEC) if now.is_first else memory
         _, memory = act(state, memory, now, jax.random.key(t), jnp.array(False))
-        np.testing.assert_allclose(AGENT.note(memory).rewards, window.note.rewards[t, 0], rtol=1e-5, atol=1e-6)
+        note = AGENT.note(memory)
+        np.testing.assert_allclose(note.rewards, window.note.rewards[t, 0], rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(note.observations, window.note.observations[t, 0], rtol=1e-5, atol=1e-6)
         np.testing.assert_allclose(memory.lstm.d, at_once.d[t, 0], rtol=1e-5, atol=1e-6)
 
 
@@ -164,16 +174,17 @@ def test_a_belief_in_the_replay_remembers_rewards_from_before_its_window(state):
     np.testing.assert_allclose(plain[..., d:], other[..., d:], rtol=1e-5)  # x_t has no memory
 
 
-def test_without_time_constants_there_is_no_memory_of_rewards():
-    agent = dataclasses.replace(AGENT, reward_memory=())
+def test_without_time_constants_there_is_no_memory_of_rewards_or_observations():
+    agent = dataclasses.replace(AGENT, reward_memory=(), observation_memory=())
     state = jax.jit(lambda key: agent.init(key, SPEC))(jax.random.key(0))
     window = noted(windows(jax.random.key(1), 1, TIME))
-    window = window._replace(note=window.note._replace(rewards=jnp.zeros((TIME, 1, 0))))
+    window = window._replace(note=window.note._replace(rewards=jnp.zeros((TIME, 1, 0)), observations=None))
     step = jax.tree.map(lambda leaf: leaf[0, 0], window.step)
     _, memory = jax.jit(agent.act)(state, agent.reset(SPEC), step, jax.random.key(2), jnp.array(False))
     d = unrolled(state, window).d[0, 0]
     np.testing.assert_allclose(memory.lstm.d, d, rtol=1e-5, atol=1e-6)
     assert agent.note(memory).rewards.shape == (0,)
+    assert agent.note(memory).observations is None
 
 
 def test_equal_rewards_tell_no_time(state):
@@ -224,11 +235,33 @@ def test_the_memory_of_rewards_decays():
     np.testing.assert_allclose(memory, [0.25 + 3, 0.9**2 + 3], rtol=1e-6)
 
 
+def test_the_memory_of_observations_has_sums_of_each_entry():
+    memory = jnp.zeros((3, 2))
+    for obs in ([1.0, 0.0, 2.0], [0.0, 0.0, 0.0], [3.0, -1.0, 0.0]):
+        memory = remember(memory, jnp.array(obs), (2.0, 10.0))
+    expected = [[0.25 + 3, 0.9**2 + 3], [-1, -1], [2 * 0.25, 2 * 0.9**2]]
+    np.testing.assert_allclose(memory, expected, rtol=1e-6)
+
+
+def test_the_memory_of_observations_is_standardised_and_read_by_the_model_and_the_controller(state):
+    """x_t ends with n_t, in units in which its entries have variances of about 1."""
+    window = noted(windows(jax.random.key(1), 2, TIME))
+    after, belief, _ = jax.jit(AGENT.learn_model)(state, window)
+    n = np.asarray(window.note.observations).reshape(TIME, 2, 6)
+    np.testing.assert_allclose(after.scales.memory.mean, n.mean((0, 1)), rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(after.scales.memory.variance, n.var((0, 1)), rtol=1e-4)
+    expected = (n - n.mean((0, 1))) / (n.std((0, 1)) + 1e-3)
+    np.testing.assert_allclose(belief[..., -6:], expected, rtol=1e-3, atol=1e-4)
+    long_ago = window._replace(note=window.note._replace(observations=window.note.observations.at[:, 0].add(1.0)))
+    other = jax.jit(AGENT.learn_model)(state, long_ago)[1]
+    assert (jnp.abs(belief - other)[:, 0, : AGENT.d_size].max(axis=-1) > 1e-4).all()
+
+
 def test_an_actor_notes_the_policy_that_chose_its_action(state):
     """Of a sampled action, the note's policy is the one at its own belief; the mode is its mean."""
     step = jax.tree.map(lambda leaf: leaf[0, 0], windows(jax.random.key(1), 1, TIME).step)
     mode, memory = jax.jit(AGENT.act)(state, AGENT.reset(SPEC), step, jax.random.key(0), jnp.array(False))
-    belief = jnp.concatenate([memory.lstm.d, state.scales.perception(step)])
+    belief = jnp.concatenate([memory.lstm.d, state.scales.perception(step, memory.note.observations)])
     policy = AGENT.note(memory).policy
     expected = state.controller.actor(standardise(state.scales.belief, belief))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), policy, expected)
@@ -240,7 +273,7 @@ def test_an_actor_notes_the_policy_that_chose_its_action(state):
 def test_transitions_in_the_pool_are_aligned_in_time(state, begun):
     after, _, window = begun
     pool, step = jax.tree.map(lambda leaf: leaf[0], after.pool.transitions), window.step
-    x = after.scales.perception(step)  # the scales of this cycle, the model before its update
+    x = after.scales.perception(step, window.note.observations)  # the scales of this cycle, the model before its update
     belief = jnp.concatenate([unrolled(state._replace(scales=after.scales), window).d, x], axis=-1)
     for t, sequence in ((0, 0), (2, 1), (5, 1)):
         row = 2 * t + sequence

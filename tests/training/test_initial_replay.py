@@ -101,11 +101,12 @@ def test_timesteps_of_another_task_are_one_sentence_and_no_folder(source, tmp_pa
     assert not (tmp_path / "run").exists()
 
 
-def test_other_notes_are_one_sentence(tmp_path):
-    for before, now, phrase in (((8.0,), (16.0,), r"reward_memory=\[8.0\], and"), ((8.0,), (), "reward_memory=")):
-        old, new = (tiny("predictive-sac", reward_memory=memory) for memory in (before, now))
+@pytest.mark.parametrize("memory", ["reward_memory", "observation_memory"])
+def test_other_notes_are_one_sentence(tmp_path, memory):
+    for now in ((16.0,), ()):
+        old, new = (tiny("predictive-sac", **{memory: constants}) for constants in ((8.0,), now))
         run = saved(tmp_path / str(len(now)), "predictive-sac", TASK, agent=old)
-        with pytest.raises(UserError, match=phrase):
+        with pytest.raises(UserError, match=rf"{memory}=\[8.0\], and"):
             initial_replay.taken(Options(init_from=str(run.folder)), new, TASK, [0])
 
 

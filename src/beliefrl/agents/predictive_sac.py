@@ -1,8 +1,9 @@
 """Predictive SAC: a soft actor-critic on the state of one LSTM that learns only to predict.
 
-The belief is s_t = [h_t, x_t], with the LSTM's state h_t and x_t = (o_t, a_{t-1}, r_{t-1}), all standardised by
-running statistics. The LSTM also reads a memory of the unusual rewards of the episode. It learns during the whole
-training, and only by predicting the next observation and reward (`models.predictive_model`). The controller
+The belief is s_t = [h_t, x_t], with the LSTM's state h_t and x_t = (o_t, a_{t-1}, r_{t-1}, n_t), all standardised by
+running statistics. n_t is a memory of the observations of the episode. The LSTM also reads a memory of its unusual
+rewards. It learns during the whole training, and only by predicting the next observation and reward
+(`models.predictive_model`). The controller
 (`models.double_q`) learns on the belief. Its gradient does not reach the LSTM.
 This agent is not from the paper. It keeps the paper's idea: a recurrent model that learns by prediction forms the
 belief, and a soft actor-critic acts on it. It has one model without latent variables where `vrm` has two with them.
@@ -30,31 +31,14 @@ from beliefrl.agents import Metrics
 from beliefrl.agents.base import ControllerAgent, Range
 from beliefrl.models import average, double_q, pool, reading
 from beliefrl.models.average import Average
-from beliefrl.models.double_q import DoubleQController, Policy, Samples
-from beliefrl.models.forecast import forecast, perceive
+from beliefrl.models.double_q import DoubleQController, Samples
+from beliefrl.models.forecast import Constants, Memory, Note, forecast, no_memory, perceive
 from beliefrl.models.nets import Gaussian, LSTMState, descend, falling_rate, standardise, update_statistics
 from beliefrl.models.pool import Pool
 from beliefrl.models.predictive_model import PredictiveModel, init_model, prediction_loss
 from beliefrl.models.scales import Scales, initial_scales
 from beliefrl.models.soft_actor_critic import OptimiserState, valid_mean
 from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range
-
-
-class Note(NamedTuple):
-    """What the replay stores with a timestep.
-
-    After the pre-training all notes are made anew: for the exploration b is the untrained policy on the new beliefs.
-    """
-
-    rewards: Float[Array, "*batch constants"]  # m_t, in units of the reward
-    policy: Policy  # b, which chose a_t
-
-
-class Memory(NamedTuple):
-    """The recurrent state of an actor."""
-
-    lstm: LSTMState
-    note: Note  # on the last timestep
 
 
 class State(NamedTuple):
@@ -134,6 +118,8 @@ class PredictiveSACAgent(ControllerAgent):
     """L: these cells start with forget biases of log U(1, L), which are time constants of 2 to L + 1 steps."""
     reward_memory: tuple[float, ...] = (8.0, 64.0, 512.0)
     """Time constants, in steps, of the memory of unusual rewards that the LSTM reads. Without any it reads none."""
+    observation_memory: tuple[float, ...] = ()
+    """Time constants, in steps, of the memory of observations that the LSTM and the controller read."""
     pool: int = 8
     """Number of the last cycles whose transitions are in the pool. There are `pool` × `sequences` readers."""
     average_rate: float = 2e-4
@@ -167,7 +153,8 @@ class PredictiveSACAgent(ControllerAgent):
         fractions = "long_memories", "trace_decay", "off_policy_trace", "pessimism"
         check_range(self, ("lr_model", "lr_model_min", "jump", *fractions), 0, 1)
         check_range(self, ("average_rate",), 1e-6, 1)
-        check_range(self, ("longest_memory", "reward_memory") if self.reward_memory else ("longest_memory",), 1)
+        memories = [name for name in ("reward_memory", "observation_memory") if getattr(self, name)]
+        check_range(self, ("longest_memory", *memories), 1)
 
     # How it is trained
 
@@ -188,21 +175,26 @@ class PredictiveSACAgent(ControllerAgent):
         return self.sequences
 
     @property
+    def constants(self) -> Constants:
+        return Constants(self.reward_memory, self.observation_memory)
+
+    @property
     def model_optimiser(self) -> optax.GradientTransformation:
         return optax.adam(falling_rate(self.lr_model, self.lr_model_updates, self.lr_model_min))
 
     def init(self, key: Key[Array, ""], spec: Spec) -> State:
         key_model, key_controller = jax.random.split(key)
-        sizes = spec.obs_dim, spec.action_dim, len(self.reward_memory)
+        remembered = spec.obs_dim * len(self.observation_memory)
+        sizes = spec.obs_dim, spec.action_dim, remembered + len(self.reward_memory)
         model = init_model(key_model, *sizes, self.d_size, self.hidden_size, self.long_memories, self.longest_memory)
-        belief = self.d_size + spec.obs_dim + spec.action_dim + 1
+        belief = self.d_size + spec.obs_dim + spec.action_dim + 1 + remembered
         settings = self.policy_layers, self.value_layers, self.alpha_start, self.normalise_critics
         with_sigma = self.critic_likelihood > 0
         controller = double_q.init_controller(key_controller, belief, spec.action_dim, *settings, with_sigma)
         return State(
             model,
             controller,
-            initial_scales(spec.obs_dim, belief),
+            initial_scales(spec.obs_dim, belief, remembered),
             model.lstm.start(self.window.readers),
             pool.empty((self.pool, self.sequences * self.seq_len), belief, spec.action_dim),
             self.model_optimiser.init(model),  # pyright: ignore[reportArgumentType]
@@ -222,17 +214,15 @@ class PredictiveSACAgent(ControllerAgent):
     # Acting
 
     def reset(self, spec: Spec) -> Memory:
-        note = Note(jnp.zeros(len(self.reward_memory)), Policy(*jnp.zeros((2, spec.action_dim))))
-        return Memory(LSTMState(*jnp.zeros((2, self.d_size))), note)
+        return no_memory(self.d_size, spec.obs_dim, spec.action_dim, self.constants)
 
     def act(
         self, state: State, memory: Memory, step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]
     ) -> tuple[Float[Array, " action"], Memory]:
-        before = memory.lstm, memory.note.rewards
-        lstm, rewards = perceive(state.model, state.scales, before, step, self.reward_memory)
-        belief = jnp.concatenate([lstm.d, state.scales.perception(step)])
+        memory, x = perceive(state.model, state.scales, memory, step, self.constants)
+        belief = jnp.concatenate([memory.lstm.d, x])
         policy = state.controller.actor(standardise(state.scales.belief, belief))
-        return self.choose_from(policy, key, explore), Memory(lstm, Note(rewards, policy))
+        return self.choose_from(policy, key, explore), memory._replace(note=memory.note._replace(policy=policy))
 
     def note(self, memory: Memory) -> Note:
         return memory.note
@@ -240,7 +230,7 @@ class PredictiveSACAgent(ControllerAgent):
     def predict(
         self, state: State, model: str, step: Timestep, observed: Bool[Array, " time"], key: Key[Array, ""]
     ) -> Gaussian:
-        return forecast(state.model, state.scales, step, observed, self.reward_memory)
+        return forecast(state.model, state.scales, step, observed, self.constants)
 
     # Learning the model
 
@@ -253,7 +243,7 @@ class PredictiveSACAgent(ControllerAgent):
     def learn_model(self, state: State, windows: Window) -> tuple[State, Float[Array, "time batch belief"], Metrics]:
         """One Adam step on J_model; also returns the beliefs, formed before the step and not standardised."""
         scales, step, after = state.scales.include(windows), windows.step, windows.between(1, None).step
-        x, valid = scales.perception(step), reading.known_transitions(windows)
+        x, valid = scales.perception(step, windows.note.observations), reading.known_transitions(windows)
         inputs, start = scales.model_input(x, windows.note.rewards), reading.start(windows, state.readers)
 
         def loss(model: PredictiveModel) -> tuple[Float[Array, ""], LSTMState]:

@@ -1,53 +1,86 @@
-"""How the model of `predictive-sac` reads an episode, and what it predicts there.
+"""How `predictive-sac` reads an episode, and what its model predicts there.
 
-h_t is the LSTM's state after x_0, ..., x_t. From h_t and a_t the model predicts x_{t+1} = (o_{t+1}, r_t). Where x_t is
-not observed, the LSTM reads its prediction instead.
+h_t is the LSTM's state after x_0, ..., x_t. From h_t and a_t the model predicts o_{t+1} and r_t. Where they are not
+observed, the LSTM reads the prediction instead.
 """
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from beliefrl.models.double_q import Policy
 from beliefrl.models.nets import Gaussian, LSTMState
 from beliefrl.models.predictive_model import PredictiveModel, remember
 from beliefrl.models.scales import Scales
 from beliefrl.types import Timestep
 
-State = tuple[LSTMState, Float[Array, " constants"]]  # of the LSTM, and m_t
+
+class Constants(NamedTuple):
+    """The time constants of both memories, in steps."""
+
+    rewards: tuple[float, ...]
+    observations: tuple[float, ...]
+
+
+class Note(NamedTuple):
+    """What the replay stores with a timestep.
+
+    After the pre-training all notes are made anew: for the exploration b is the untrained policy on the new beliefs.
+    """
+
+    rewards: Float[Array, "*batch constants"]  # m_t, in units of the reward
+    policy: Policy  # b, which chose a_t
+    observations: Float[Array, "*batch obs constants"] | None = None  # n_t, in units of the observation
+
+
+class Memory(NamedTuple):
+    """The recurrent state of an actor."""
+
+    lstm: LSTMState
+    note: Note  # on the last timestep
+
+
+def no_memory(d: int, obs: int, action: int, constants: Constants) -> Memory:
+    """The memory before an episode, given the sizes of the LSTM's state, the observation and the action."""
+    observations = jnp.zeros((obs, len(constants.observations))) if constants.observations else None
+    note = Note(jnp.zeros(len(constants.rewards)), Policy(*jnp.zeros((2, action))), observations)
+    return Memory(LSTMState(*jnp.zeros((2, d))), note)
 
 
 def perceive(
-    model: PredictiveModel, scales: Scales, before: State, step: Timestep, constants: tuple[float, ...]
-) -> State:
-    """The state after one more timestep, given the time constants of m_t."""
+    model: PredictiveModel, scales: Scales, before: Memory, step: Timestep, constants: Constants
+) -> tuple[Memory, Float[Array, " x"]]:
+    """The memory after one more timestep, whose note has no policy yet, and x_t."""
     excess = jnp.where(step.is_first, 0.0, scales.usual.excess(step.reward))
-    rewards = remember(before[1], excess, constants)
-    inputs = scales.model_input(scales.perception(step), rewards)
-    return model.lstm.step(before[0], inputs, step.is_first), rewards
+    rewards = remember(before.note.rewards, excess, constants.rewards)
+    observations = before.note.observations
+    if observations is not None:
+        observations = remember(observations, step.obs, constants.observations)
+    x = scales.perception(step, observations)
+    lstm = model.lstm.step(before.lstm, scales.model_input(x, rewards), step.is_first)
+    return Memory(lstm, before.note._replace(rewards=rewards, observations=observations)), x
 
 
 def forecast(
-    model: PredictiveModel,
-    scales: Scales,
-    steps: Timestep,
-    observed: Bool[Array, " time"],
-    constants: tuple[float, ...],
+    model: PredictiveModel, scales: Scales, steps: Timestep, observed: Bool[Array, " time"], constants: Constants
 ) -> Gaussian:
-    """Predictions of x_t along one episode from its first timestep on, leaves (time, x), in the units of the task.
+    """Predictions of (o_t, r_{t-1}) along one episode from its first timestep on, (time, x), in the task's units.
 
     Each is made one step ahead, from h_{t-1} and a_{t-1}, so the first timestep has none: its entries are NaN. The
     first timestep must be observed. σ is 0, because the model is deterministic.
     """
 
-    def advance(carry: tuple[State, Array], given: tuple) -> tuple[tuple[State, Array], Array]:
-        (state, predicted), (step, seen, action) = carry, given
+    def advance(carry: tuple[Memory, Array], given: tuple) -> tuple[tuple[Memory, Array], Array]:
+        (memory, predicted), (step, seen, action) = carry, given
         obs, reward = jnp.where(seen, step.obs, predicted[:-1]), jnp.where(seen, step.reward, predicted[-1])
-        state = perceive(model, scales, state, step._replace(obs=obs, reward=reward), constants)
-        after = scales.in_units(model.predict(state[0].d, action))
-        return (state, after), predicted
+        memory, _ = perceive(model, scales, memory, step._replace(obs=obs, reward=reward), constants)
+        after = scales.in_units(model.predict(memory.lstm.d, action))
+        return (memory, after), predicted
 
     action = jnp.roll(steps.prev_action, -1, axis=0)  # a_t; the last one is not used
-    lstm = jax.tree.map(lambda leaf: leaf[0], model.lstm.start(1))
-    start = (lstm, jnp.zeros(len(constants))), jnp.full(steps.obs.shape[-1] + 1, jnp.nan)
+    obs = steps.obs.shape[-1]
+    start = no_memory(model.lstm.w_d.shape[0], obs, action.shape[-1], constants), jnp.full(obs + 1, jnp.nan)
     mean = jax.lax.scan(advance, start, (steps, observed, action))[1]
     return Gaussian(mean, jnp.zeros_like(mean))

@@ -1,8 +1,9 @@
 """A recurrent model that learns only to predict; its state is the belief of `predictive-sac`.
 
-With x_t = (o_t, a_{t-1}, r_{t-1}), observations and rewards in standardised units, and a memory m_t of unusual rewards
-with one entry for each time constant T:
+With x_t = (o_t, a_{t-1}, r_{t-1}, n_t) in standardised units, except for the action, a memory n_t of observations and
+a memory m_t of unusual rewards, both with entries for each of their time constants T:
 
+    n_t                  = (1 - 1/T) n_{t-1} + o_t,  o_t at the first timestep of an episode
     m_t                  = (1 - 1/T) m_{t-1} + u(r_{t-1}),  zero at the first timestep of an episode
     u(r)                 = r - r̄ where |r - r̄| > 5 δ,  0 elsewhere
     h_t                  = LSTM(h_{t-1}; [x_t, m_t / σ_r])
@@ -14,12 +15,13 @@ memory: the biases of their forget gates are log U(1, T), so their time constant
 Ollivier 2018, "chrono initialisation", but with the usual biases of the input gates). An LSTM with the usual biases
 forgets an event within some tens of steps. Predictions one step ahead do not train it to remember longer.
 
-The memory m_t needs no learning. The replay stores it, so a window that begins in the middle of an episode has the
-memory of the whole episode. r̄ and δ are the median and the mean absolute deviation of the rewards of the exploration:
-averages over the batches of the pre-training. They do not change afterwards, so m_t has one meaning in the whole
-replay. m_t has no usual rewards, for two reasons. If all rewards are equal, m_t would only tell the time. If they vary
-at every step, m_t might only identify the episode. But where a better policy has other rewards at most steps than the
-exploration had, they all count as unusual. Then m_t / σ_r can stay at its limit, and tells nothing.
+The memories need no learning. If velocities are observed, n_t tells how far the positions have changed. The replay
+stores both, so a window that begins in the middle of an episode has the memories of the whole episode. r̄ and δ are the
+median and the mean absolute deviation of the rewards of the exploration: averages over the batches of the pre-training.
+They do not change afterwards, so m_t has one meaning in the whole replay. m_t has no usual rewards, for two reasons. If
+all rewards are equal, m_t would only tell the time. If they vary at every step, m_t might only identify the episode.
+But where a better policy has other rewards at most steps than the exploration had, they all count as unusual. Then m_t
+/ σ_r can stay at its limit, and tells nothing.
 """
 
 from typing import NamedTuple
@@ -42,7 +44,7 @@ class PredictiveModel(eqx.Module):
     predictor: MLP
 
     def __init__(self, obs: int, action: int, memories: int, d: int, hidden: int):
-        """Sizes of o_t, a_t, m_t, the state of the LSTM, and the hidden layer of the predictor."""
+        """Sizes of o_t, a_t, (n_t, m_t), the state of the LSTM, and the hidden layer of the predictor."""
         self.lstm = LSTM(obs + action + 1 + memories, d)
         self.predictor = MLP((d + action, hidden, obs + 1), jax.nn.relu)
 
@@ -75,10 +77,11 @@ class Usual(NamedTuple):
 
 
 def remember(
-    before: Float[Array, " constants"], excess: Float[Array, ""], constants: tuple[float, ...]
-) -> Float[Array, " constants"]:
-    """m_t, given m_{t-1}, u(r_{t-1}) and the time constants in steps."""
-    return (1 - 1 / jnp.array(constants)) * before + excess
+    before: Float[Array, "*entry constants"], new: Float[Array, "*entry"], constants: tuple[float, ...]
+) -> Float[Array, "*entry constants"]:
+    """m_t or n_t, given that of the timestep before, u(r_{t-1}) or o_t, and the time constants in steps."""
+    kept = jnp.broadcast_to(1 - 1 / jnp.array(constants), before.shape)
+    return kept * before + new[..., None]
 
 
 def init_model(

@@ -18,23 +18,30 @@ class Scales(NamedTuple):
     reward: RunningStatistics
     belief: RunningStatistics
     usual: Usual  # r̄ and δ, from the pre-training
+    memory: RunningStatistics | None  # of n_t, if there is one
 
     def include(self, windows: Window) -> "Scales":
-        """With the observations and rewards of one more batch."""
-        step = windows.step
+        """With the observations, rewards and memories of observations of one more batch."""
+        step, memory = windows.step, self.memory
+        if memory is not None:
+            memory = update_statistics(memory, _flat(windows.note.observations), windows.exists)
         return self._replace(
             obs=update_statistics(self.obs, step.obs, windows.exists),
             reward=update_statistics(self.reward, step.reward[..., None], windows.exists & ~step.is_first),
+            memory=memory,
         )
 
     def standardised(self, step: Timestep) -> tuple[Float[Array, "*batch obs"], Float[Array, "*batch 1"]]:
         """o_t and r_{t-1}, standardised."""
         return standardise(self.obs, step.obs), standardise(self.reward, step.reward[..., None])
 
-    def perception(self, step: Timestep) -> Float[Array, "*batch x"]:
-        """x_t = (o_t, a_{t-1}, r_{t-1}), observation and reward standardised."""
+    def perception(
+        self, step: Timestep, memory: Float[Array, "*batch obs constants"] | None
+    ) -> Float[Array, "*batch x"]:
+        """x_t = (o_t, a_{t-1}, r_{t-1}, n_t), all but the action standardised, given n_t if there is one."""
         obs, reward = self.standardised(step)
-        return jnp.concatenate([obs, step.prev_action, reward], axis=-1)
+        remembered = [] if memory is None else [standardise(self.memory, _flat(memory))]
+        return jnp.concatenate([obs, step.prev_action, reward, *remembered], axis=-1)
 
     def model_input(
         self, x: Float[Array, "*batch x"], rewards: Float[Array, "*batch constants"]
@@ -54,7 +61,11 @@ class Scales(NamedTuple):
         return mean + deviation * prediction
 
 
-def initial_scales(obs: int, belief: int) -> Scales:
-    """The statistics before any batch, given the sizes of observations and beliefs."""
+def initial_scales(obs: int, belief: int, memory: int) -> Scales:
+    """The statistics before any batch, given the sizes of o_t, s_t and n_t."""
     of_obs, of_reward, of_belief = map(initial_statistics, (obs, 1, belief))
-    return Scales(of_obs, of_reward, of_belief, Usual(*jnp.zeros(3)))
+    return Scales(of_obs, of_reward, of_belief, Usual(*jnp.zeros(3)), initial_statistics(memory) if memory else None)
+
+
+def _flat(memory: Float[Array, "*batch obs constants"]) -> Float[Array, "*batch entries"]:
+    return memory.reshape(*memory.shape[:-2], -1)

@@ -25,7 +25,12 @@ from beliefrl.types import Spec, UserError, plain
 
 FILE = "initial-replay.safetensors"
 ADDED = "added"  # the number of timesteps of each ring, among the arrays of the file
-NOTED = ("reward_memory", "store_state", "store_first_impression")  # what the agents' notes on timesteps depend on
+NOTED = (  # what the agents' notes on timesteps depend on
+    "reward_memory",
+    "observation_memory",
+    "store_state",
+    "store_first_impression",
+)
 
 
 def taken(options: Options, agent: Agent, task: Any, seeds: list[int]) -> tuple[dict[str, np.ndarray], dict[str, int]]:
