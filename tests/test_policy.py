@@ -20,7 +20,7 @@ SMALL = {
     "vrm": {"d_size": 8, "z_size": 4, "hidden_size": 8},
     "sac-mlp": {},
     "sac-lstm": {"d_size": 8},
-    "predictive-sac": {"d_size": 8, "hidden_size": 8},
+    "predictive-sac": {"d_size": 8, "hidden_size": 8, "observation_memory": (4.0, 32.0)},
     "slac": {"z1_size": 2, "z2_size": 4, "model_layers": (8,), "history": 3},
 }
 TASK = tasks.make("pendulum-p", max_steps=4)

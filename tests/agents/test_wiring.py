@@ -7,8 +7,6 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from beliefrl.agents.predictive_sac import Note
-from beliefrl.models.double_q import Policy
 from beliefrl.types import Reading
 from inputs import SPEC, same, windows
 from worlds import tiny
@@ -17,7 +15,7 @@ BASES = {
     "sac-mlp": tiny("sac-mlp", batch_size=6),
     "vrm": tiny("vrm", seq_len=4, batch_size=2, burn_in=2),
     "slac": tiny("slac", batch_size=2),
-    "predictive-sac": tiny("predictive-sac", seq_len=6, sequences=2, pool=2, batch_size=16),
+    "predictive-sac": tiny("predictive-sac", seq_len=6, sequences=2, pool=2, batch_size=16, observation_memory=()),
 }
 MODEL = {"vrm": "keep", "slac": "model", "predictive-sac": "model"}  # where it is in the state
 
@@ -25,15 +23,11 @@ MODEL = {"vrm": "keep", "slac": "model", "predictive-sac": "model"}  # where it 
 def learned(agent, name):
     """The parts of the agent after one cycle and its first update."""
     window = windows(jax.random.key(1), agent.cycle_windows, agent.window.length + 1)
-    if name == "predictive-sac":
-        zeros, reader = jnp.zeros_like(window.step.prev_action), jnp.arange(agent.cycle_windows)
-        rewards = jnp.zeros((*window.step.reward.shape, len(agent.reward_memory)))
-        reading = Reading(reader, jnp.zeros(reader.shape, bool))
-        window = window._replace(note=Note(rewards, Policy(zeros, zeros)), reading=reading)
-    elif name == "vrm":
-        memory = jax.eval_shape(lambda: agent.note(agent.reset(SPEC)))
-        note = jax.tree.map(lambda leaf: jnp.zeros((*window.step.reward.shape, *leaf.shape)), memory)
-        window = window._replace(note=note)
+    memory = jax.eval_shape(lambda: agent.note(agent.reset(SPEC)))
+    note = jax.tree.map(lambda leaf: jnp.zeros((*window.step.reward.shape, *leaf.shape)), memory)
+    reader = jnp.arange(agent.cycle_windows)
+    reading = Reading(reader, jnp.zeros(reader.shape, bool)) if name == "predictive-sac" else None
+    window = window._replace(note=note, reading=reading)
 
     @jax.jit
     def cycle(window):

@@ -160,7 +160,13 @@ def test_every_agent_goes_on_to_the_last_bit(tmp_path, name):
     sizes = {
         "vrm": models | sequences,
         "sac-lstm": {"d_size": 8, "pretrain_updates": 10} | sequences,
-        "predictive-sac": {"d_size": 8, "hidden_size": 8, "pretrain_updates": 10, "seq_len": 8},
+        "predictive-sac": {
+            "d_size": 8,
+            "hidden_size": 8,
+            "pretrain_updates": 10,
+            "seq_len": 8,
+            "observation_memory": (4.0,),
+        },
         "slac": {"z1_size": 2, "z2_size": 4, "model_layers": (8,), "batch_size": 2, "pretrain_updates": 10},
     }
     agent = agents.make(name, step_start_rl=20, policy_layers=(8,), value_layers=(8,), **sizes[name])
