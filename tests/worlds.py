@@ -26,7 +26,7 @@ TINY = {
 def tiny(name, **hyperparameters):
     """An agent with small networks; an ablation's name will do."""
     sizes = TINY["vrm" if name.startswith("vrm") else name]
-    return agents.make(name, policy_layers=(8,), value_layers=(8,), **sizes, **hyperparameters)
+    return agents.make(name, policy_layers=(8,), value_layers=(8,), **(sizes | hyperparameters))
 
 
 @partial(jax.jit, static_argnums=(0, 1))
