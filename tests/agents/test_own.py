@@ -114,10 +114,11 @@ def test_an_agent_is_restored_from_its_record(agent):
 
 def test_what_a_record_lacks_has_the_value_from_before_it_existed():
     record = recorded(named("predictive-sac"))
-    for newer in ("normalise_critics", "lr_model_min", "pessimism", "critic_likelihood"):
+    for newer in ("normalise_critics", "lr_model_min", "pessimism", "critic_likelihood", "observation_memory"):
         del record[newer]
     made = hyperparameters.restored(PredictiveSACAgent, record)
     assert (made.normalise_critics, made.pessimism, made.critic_likelihood) == (False, 1.0, 0.0)
+    assert made.observation_memory == ()
     assert made.lr_model_min >= made.lr_model  # the learning rate is constant
     for name, values in agents.before().items():
         assert values.keys() <= hyperparameters.of(named(name)).keys()

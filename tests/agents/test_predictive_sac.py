@@ -171,7 +171,7 @@ def test_a_belief_in_the_replay_remembers_rewards_from_before_its_window(state):
     plain, other = learn(state, window)[1], learn(state, long_ago)[1]
     d = AGENT.d_size
     assert (jnp.abs(plain - other)[:, 0, :d].max(axis=-1) > 1e-4).all()
-    np.testing.assert_allclose(plain[..., d:], other[..., d:], rtol=1e-5)  # x_t has no memory
+    np.testing.assert_allclose(plain[..., d:], other[..., d:], rtol=1e-5)  # x_t has no memory of rewards
 
 
 def test_without_time_constants_there_is_no_memory_of_rewards_or_observations():

@@ -262,16 +262,23 @@ def test_other_layers_are_one_sentence_and_no_folder(tmp_path, recorded):
     assert not (tmp_path / "run").exists()
 
 
-def test_a_run_from_before_the_likelihood_is_not_continued_with_it(tmp_path):
-    old = tiny("predictive-sac", critic_likelihood=0.0)
+@pytest.mark.parametrize(
+    ("name", "before", "now", "as_initial"),
+    [
+        ("critic_likelihood", 0.0, "0.1", r"=0.0, and this training has 0.1; set critic_likelihood=0.0"),
+        ("observation_memory", (), r"\[4.0, 32.0\]", r"the agent and all sizes must be the same"),
+    ],
+)
+def test_a_run_from_before_an_option_is_not_continued_with_it(tmp_path, name, before, now, as_initial):
+    old = tiny("predictive-sac", **{name: before})
     source = saved(tmp_path / "source", "predictive-sac", TASK, agent=old)
     config = json.loads((source.folder / "config.json").read_text())
-    assert config["hyperparameters"].pop("critic_likelihood") == 0
+    assert not config["hyperparameters"].pop(name)
     (source.folder / "config.json").write_text(json.dumps(config))
     initial.taken(Options(init_from=str(source.folder)), old, TASK.spec)
-    with pytest.raises(UserError, match=r"was trained with critic_likelihood=0.0, not 0.1"):
+    with pytest.raises(UserError, match=rf"was trained with {name}=\S+, not {now}"):
         train(tiny("predictive-sac"), TASK, source.folder, resume=True, **source.config["options"])
-    with pytest.raises(UserError, match=r"critic_likelihood=0.0, and this training has 0.1; set critic_likelihood=0.0"):
+    with pytest.raises(UserError, match=as_initial):
         train(tiny("predictive-sac"), TASK, tmp_path / "run", init_from=source)
     assert not (tmp_path / "run").exists()
 

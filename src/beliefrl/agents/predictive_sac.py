@@ -1,15 +1,16 @@
 """Predictive SAC: a soft actor-critic on the state of one LSTM that learns only to predict.
 
 The belief is s_t = [h_t, x_t], with the LSTM's state h_t and x_t = (o_t, a_{t-1}, r_{t-1}, n_t), all standardised by
-running statistics. n_t is a memory of the observations of the episode. The LSTM also reads a memory of its unusual
-rewards. It learns during the whole training, and only by predicting the next observation and reward
-(`models.predictive_model`). The controller
-(`models.double_q`) learns on the belief. Its gradient does not reach the LSTM.
+running statistics. n_t is a memory of the observations of the episode, which is off by default. The LSTM also reads a
+memory of its unusual rewards. It learns during the whole training, and only by predicting the next observation and
+reward (`models.predictive_model`). The controller (`models.double_q`) learns on the belief. Its gradient does not reach
+the LSTM.
 This agent is not from the paper. It keeps the paper's idea: a recurrent model that learns by prediction forms the
 belief, and a soft actor-critic acts on it. It has one model without latent variables where `vrm` has two with them.
 
 The model reads the replay in order (`training.replay.Readers`): a reader's window begins with the state at the end of
-its last one. So a belief knows the episode since its beginning, or since the reader's last jump, which empties it.
+its last one. So h_t knows the episode since its beginning, or since the reader's last jump, which empties it. The
+memories are of the whole episode, because the replay stores them.
 
 The beliefs of the windows of a cycle become transitions. A pool has those of the last `pool` cycles with their targets,
 and the controller's batches are drawn from it: the windows of one cycle are too few and too correlated.
@@ -119,8 +120,8 @@ class PredictiveSACAgent(ControllerAgent):
     reward_memory: tuple[float, ...] = (8.0, 64.0, 512.0)
     """Time constants, in steps, of the memory of unusual rewards that the LSTM reads. Without any it reads none."""
     observation_memory: tuple[float, ...] = ()
-    """Time constants, in steps, of the memory of observations that the LSTM and the controller read. 8 64 512 help
-    where velocities are observed and positions are hidden."""
+    """Time constants, in steps, of the memory of observations that the LSTM and the controller read. Without any they
+    read none. Try 8 64 512 where velocities are observed and positions are hidden."""
     pool: int = 8
     """Number of the last cycles whose transitions are in the pool. There are `pool` × `sequences` readers."""
     average_rate: float = 2e-4
@@ -142,7 +143,13 @@ class PredictiveSACAgent(ControllerAgent):
         "pool": (4, 8, 16),
     }
     predictors = ("lstm",)
-    values_before = {"normalise_critics": False, "lr_model_min": 1.0, "average_rate": 1.0, "critic_likelihood": 0.0}
+    values_before = {
+        "normalise_critics": False,
+        "lr_model_min": 1.0,
+        "average_rate": 1.0,
+        "critic_likelihood": 0.0,
+        "observation_memory": (),
+    }
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
@@ -176,7 +183,7 @@ class PredictiveSACAgent(ControllerAgent):
         return self.sequences
 
     @property
-    def constants(self) -> Constants:
+    def time_constants(self) -> Constants:
         return Constants(self.reward_memory, self.observation_memory)
 
     @property
@@ -215,12 +222,12 @@ class PredictiveSACAgent(ControllerAgent):
     # Acting
 
     def reset(self, spec: Spec) -> Memory:
-        return no_memory(self.d_size, spec.obs_dim, spec.action_dim, self.constants)
+        return no_memory(self.d_size, spec.obs_dim, spec.action_dim, self.time_constants)
 
     def act(
         self, state: State, memory: Memory, step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]
     ) -> tuple[Float[Array, " action"], Memory]:
-        memory, x = perceive(state.model, state.scales, memory, step, self.constants)
+        memory, x = perceive(state.model, state.scales, memory, step, self.time_constants)
         belief = jnp.concatenate([memory.lstm.d, x])
         policy = state.controller.actor(standardise(state.scales.belief, belief))
         return self.choose_from(policy, key, explore), memory._replace(note=memory.note._replace(policy=policy))
@@ -231,7 +238,7 @@ class PredictiveSACAgent(ControllerAgent):
     def predict(
         self, state: State, model: str, step: Timestep, observed: Bool[Array, " time"], key: Key[Array, ""]
     ) -> Gaussian:
-        return forecast(state.model, state.scales, step, observed, self.constants)
+        return forecast(state.model, state.scales, step, observed, self.time_constants)
 
     # Learning the model
 

@@ -52,7 +52,7 @@ def no_memory(d: int, obs: int, action: int, constants: Constants) -> Memory:
 def perceive(
     model: PredictiveModel, scales: Scales, before: Memory, step: Timestep, constants: Constants
 ) -> tuple[Memory, Float[Array, " x"]]:
-    """The memory after one more timestep, whose note has no policy yet, and x_t."""
+    """The memory after one more timestep, whose note still has the policy before, and x_t."""
     excess = jnp.where(step.is_first, 0.0, scales.usual.excess(step.reward))
     rewards = remember(before.note.rewards, excess, constants.rewards)
     observations = before.note.observations
@@ -66,10 +66,10 @@ def perceive(
 def forecast(
     model: PredictiveModel, scales: Scales, steps: Timestep, observed: Bool[Array, " time"], constants: Constants
 ) -> Gaussian:
-    """Predictions of (o_t, r_{t-1}) along one episode from its first timestep on, (time, x), in the task's units.
+    """Predictions of (o_t, r_{t-1}) along one episode from its first timestep on, in the units of the task.
 
-    Each is made one step ahead, from h_{t-1} and a_{t-1}, so the first timestep has none: its entries are NaN. The
-    first timestep must be observed. σ is 0, because the model is deterministic.
+    The leaves are (time, prediction). Each is made one step ahead, from h_{t-1} and a_{t-1}, so the first timestep has
+    none: its entries are NaN. The first timestep must be observed. σ is 0, because the model is deterministic.
     """
 
     def advance(carry: tuple[Memory, Array], given: tuple) -> tuple[tuple[Memory, Array], Array]:

@@ -1,7 +1,7 @@
 """A recurrent model that learns only to predict; its state is the belief of `predictive-sac`.
 
-With x_t = (o_t, a_{t-1}, r_{t-1}, n_t) in standardised units, except for the action, a memory n_t of observations and
-a memory m_t of unusual rewards, both with entries for each of their time constants T:
+x_t = (o_t, a_{t-1}, r_{t-1}, n_t) is standardised, except for the action. n_t is a memory of observations and m_t one
+of unusual rewards. Each has entries for its time constants T, in the units of the task:
 
     n_t                  = (1 - 1/T) n_{t-1} + o_t,  o_t at the first timestep of an episode
     m_t                  = (1 - 1/T) m_{t-1} + u(r_{t-1}),  zero at the first timestep of an episode

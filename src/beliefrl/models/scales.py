@@ -54,7 +54,7 @@ class Scales(NamedTuple):
         """(o_t, r_{t-1}), standardised: what the model predicts from h_{t-1} and a_{t-1}."""
         return jnp.concatenate(self.standardised(step), axis=-1)
 
-    def in_units(self, prediction: Float[Array, "*batch x"]) -> Float[Array, "*batch x"]:
+    def in_units(self, prediction: Float[Array, "*batch prediction"]) -> Float[Array, "*batch prediction"]:
         """(o_t, r_{t-1}) in the units of the task, from a prediction."""
         both = jax.tree.map(lambda *parts: jnp.concatenate(parts), self.obs[:2], self.reward[:2])
         mean, deviation = (jnp.broadcast_to(leaf, prediction.shape) for leaf in (both[0], deviations(both[1])))

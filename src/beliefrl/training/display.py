@@ -19,7 +19,7 @@ from beliefrl.runs.run import Run
 from beliefrl.training.evaluation import as_argument
 from beliefrl.training.schedule import Event, Phase
 from beliefrl.training.screen import Screen, duration
-from beliefrl.types import UserError
+from beliefrl.types import UserError, plain
 
 
 class TrainingDisplay:
@@ -158,7 +158,7 @@ def run_table(run: Run, agent: Any) -> Table:
     config = run.config
     own = {} if agent is None else {field.name: field.default for field in dataclasses.fields(agent)}
     known = values_before(agent) | config["hyperparameters"]
-    changed = [f"{name}={value}" for name, value in known.items() if _differs(value, own.get(name))]
+    changed = [f"{name}={value}" for name, value in known.items() if plain(value) != plain(own.get(name))]
     constants = [f"{name}={value}" for name, value in config["constants"].items()]
     observed = [] if config.get("observe") is None else [f"observe={' '.join(map(str, config['observe']))}"]
     faults = [f"{name}={value}" for name, value in config.get("faults", {}).items()]
@@ -195,10 +195,6 @@ def _origin(initial: dict[str, Any]) -> str:
     taken, step = initial.get("timesteps"), initial.get("replay_step")
     replay = f", and its replay of step {step:,} (at most {taken:,} timesteps)" if taken and step else ""
     return f"{which} agent of {source}, commit {initial.get('git_commit')}{replay}"
-
-
-def _differs(value: Any, default: Any) -> bool:
-    return value != (list(default) if isinstance(default, tuple) else default)
 
 
 def scalability_table(results: dict[str, dict[str, Any]], obs: int, actions: int) -> Table:
