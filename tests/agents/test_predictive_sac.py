@@ -1,6 +1,7 @@
 """Predictive SAC: beliefs and transitions in time, where gradients go, the pool."""
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -446,10 +447,12 @@ def test_what_does_not_exist_changes_nothing(state):
         ("average_rate", 0.0),
         ("lr_model_updates", 0),
         ("lr_model_min", -0.1),
+        ("reward_memory", (8.0, 0.5)),
+        ("observation_memory", (0.5,)),
     ],
 )
 def test_impossible_values_are_refused(field, value):
-    with pytest.raises(UserError, match=f"{field}={value} is impossible"):
+    with pytest.raises(UserError, match=re.escape(f"{field}={value} is impossible")):
         PredictiveSACAgent(**{field: value})
 
 

@@ -161,7 +161,7 @@ class PredictiveSACAgent(ControllerAgent):
         fractions = "long_memories", "trace_decay", "off_policy_trace", "pessimism"
         check_range(self, ("lr_model", "lr_model_min", "jump", *fractions), 0, 1)
         check_range(self, ("average_rate",), 1e-6, 1)
-        memories = [name for name in ("reward_memory", "observation_memory") if getattr(self, name)]
+        memories = [name for name in ("reward_memory", "observation_memory") if getattr(self, name) != ()]
         check_range(self, ("longest_memory", *memories), 1)
 
     # How it is trained
