@@ -5,12 +5,13 @@ running statistics. n_t is a memory of the observations of the episode, which is
 memory of its unusual rewards. It learns during the whole training, and only by predicting the next observation and
 reward (`models.predictive_model`). The controller (`models.double_q`) learns on the belief. Its gradient does not reach
 the LSTM.
+
 This agent is not from the paper. It keeps the paper's idea: a recurrent model that learns by prediction forms the
 belief, and a soft actor-critic acts on it. It has one model without latent variables where `vrm` has two with them.
 
 The model reads the replay in order (`training.replay.Readers`): a reader's window begins with the state at the end of
-its last one. So h_t knows the episode since its beginning, or since the reader's last jump, which empties it. The
-memories are of the whole episode, because the replay stores them.
+its last one. So h_t knows the episode since its beginning, or since the reader's last jump, which empties it. Both
+memories know the whole episode, because the replay stores them.
 
 The beliefs of the windows of a cycle become transitions. A pool has those of the last `pool` cycles with their targets,
 and the controller's batches are drawn from it: the windows of one cycle are too few and too correlated.

@@ -32,7 +32,7 @@ class Note(NamedTuple):
 
     rewards: Float[Array, "*batch constants"]  # m_t, in units of the reward
     policy: Policy  # b, which chose a_t
-    observations: Float[Array, "*batch obs constants"] | None = None  # n_t, in units of the observation
+    observations: Float[Array, "*batch obs constants"] | None  # n_t, in units of the observation
 
 
 class Memory(NamedTuple):
@@ -52,7 +52,7 @@ def no_memory(d: int, obs: int, action: int, constants: Constants) -> Memory:
 def perceive(
     model: PredictiveModel, scales: Scales, before: Memory, step: Timestep, constants: Constants
 ) -> tuple[Memory, Float[Array, " x"]]:
-    """The memory after one more timestep, whose note still has the policy before, and x_t."""
+    """The memory after one more timestep, and x_t. The policy in its note is still the last one; `act` replaces it."""
     excess = jnp.where(step.is_first, 0.0, scales.usual.excess(step.reward))
     rewards = remember(before.note.rewards, excess, constants.rewards)
     observations = before.note.observations
