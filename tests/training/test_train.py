@@ -266,7 +266,7 @@ def test_other_layers_are_one_sentence_and_no_folder(tmp_path, recorded):
     ("name", "before", "now", "as_initial"),
     [
         ("critic_likelihood", 0.0, "0.1", r"=0.0, and this training has 0.1; set critic_likelihood=0.0"),
-        ("observation_memory", (), r"\[4.0, 32.0\]", r"the agent and all sizes must be the same"),
+        ("observation_memory", (), r"\[4.0, 32.0\]", r"=\[\], and this training has \[4.0, 32.0\]; set observation_m"),
     ],
 )
 def test_a_run_from_before_an_option_is_not_continued_with_it(tmp_path, name, before, now, as_initial):
@@ -280,6 +280,14 @@ def test_a_run_from_before_an_option_is_not_continued_with_it(tmp_path, name, be
         train(tiny("predictive-sac"), TASK, source.folder, resume=True, **source.config["options"])
     with pytest.raises(UserError, match=as_initial):
         train(tiny("predictive-sac"), TASK, tmp_path / "run", init_from=source)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("name", ["reward_memory", "observation_memory"])
+def test_other_time_constants_are_one_sentence_though_all_shapes_are_equal(tmp_path, name):
+    source = saved(tmp_path / "source", "predictive-sac", TASK, agent=tiny("predictive-sac", **{name: (2.0, 5.0)}))
+    with pytest.raises(UserError, match=rf"{name}=\[2.0, 5.0\], and this training has \[4.0, 32.0\]; set {name}="):
+        train(tiny("predictive-sac", **{name: (4.0, 32.0)}), TASK, tmp_path / "run", init_from=source)
     assert not (tmp_path / "run").exists()
 
 

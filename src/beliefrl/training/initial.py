@@ -19,9 +19,12 @@ from beliefrl.runs.options import Options
 from beliefrl.runs.run import Run
 from beliefrl.training import initial_replay
 from beliefrl.training.phases import SeedState
-from beliefrl.types import Spec, UserError
+from beliefrl.types import Spec, UserError, plain
 
 FILE = "initial.safetensors"
+MEANING = {"normalise_critics": False, "critic_likelihood": False, "reward_memory": (), "observation_memory": ()}
+"""Hyperparameters that change what the arrays mean, and their value in an agent without them. Of those with False it
+only matters whether they are on."""
 
 
 def seeds_there(options: Options) -> list[int]:
@@ -36,8 +39,8 @@ def taken(options: Options, agent: Agent, spec: Spec) -> tuple[dict[str, np.ndar
     Seed n starts from seed n of the other run. If the other run has fewer seeds, its seeds are reused in a cycle.
 
     Raises:
-        UserError: there is no such run, it has no trained agent, or the agents differ in an array or in whether
-            layers are normalised.
+        UserError: there is no such run, it has no trained agent, or the agents differ in an array, in whether layers
+            are normalised, or in the time constants of a memory.
     """
     source = Run(options.init_from or "")
     path = source.agents(options.init_best)
@@ -45,9 +48,9 @@ def taken(options: Options, agent: Agent, spec: Spec) -> tuple[dict[str, np.ndar
         saved = _fitting(source, arrays.load(path), agent, spec)
     except UserError:
         if source.config["agent"] == agents.name_of(agent):
-            _refuse_other_critics(source, agent)  # a hyperparameter says more than the first array that differs
+            _refuse_other_settings(source, agent)  # a hyperparameter says more than the first array that differs
         raise
-    _refuse_other_critics(source, agent)
+    _refuse_other_settings(source, agent)
     seeds, index = range(options.seed, options.seed + options.seeds), seeds_there(options)
     ends = best.evaluations(source.folder, len(source.seeds)) if options.init_best else _last_steps(source)
     session = [source.config, *source.config.get("resumed", ())][-1]
@@ -105,15 +108,16 @@ def _last_steps(source: Run) -> list[dict[str, Any] | None]:
     return [None if step is None else {"step": step} for step in steps]
 
 
-def _refuse_other_critics(source: Run, agent: Agent) -> None:
-    """Layer normalisation has no arrays of its own, so `_fitting` cannot see it. σ changes the shape of arrays.
+def _refuse_other_settings(source: Run, agent: Agent) -> None:
+    """Refuse hyperparameters that change what the arrays mean, and that `_fitting` cannot see or names badly.
 
-    Runs from before these hyperparameters have no entries.
+    Layer normalisation has no arrays of its own, and memories with other time constants may have equal shapes. Runs
+    from before these hyperparameters have no entries.
     """
     recorded = values_before(agent) | source.config["hyperparameters"]
-    for name in ("normalise_critics", "critic_likelihood"):
-        here, there = getattr(agent, name, False), recorded.get(name, False)
-        if bool(there) != bool(here):
+    for name, absent in MEANING.items():
+        here, there = plain(getattr(agent, name, absent)), plain(recorded.get(name, absent))
+        if bool(here) != bool(there) or (absent == () and here != there):
             raise UserError(
                 f"{source.folder} cannot be init_from: it was trained with {name}={there}, and this training "
                 f"has {here}; set {name}={there}."
