@@ -12,7 +12,6 @@ import functools
 import os
 import pathlib
 from collections.abc import Callable
-from numbers import Real
 from typing import Any
 
 import jax
@@ -23,13 +22,15 @@ import numpy as np
 from beliefrl import agents, onnx
 from beliefrl.agents import Agent
 from beliefrl.analysis.figures import check_folder
+from beliefrl.policy_inputs import check_finite, each, flags, numbers
 from beliefrl.runs.arrays import write_whole
 from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.environment import TaskEnvironment
 from beliefrl.tasks.gymnasium import GymnasiumTask
-from beliefrl.training.evaluation import restore_seed
-from beliefrl.types import LARGEST, Spec, Timestep, UserError, as_array, cause, check_whole, short
+from beliefrl.tasks.interface import Interface
+from beliefrl.training.evaluation import restore_policy, task_of
+from beliefrl.types import LARGEST, Spec, Timestep, UserError, cause, check_whole
 
 State = tuple[np.ndarray, ...]
 
@@ -46,14 +47,16 @@ class Policy:
         precision: str = "float32",
         task: str = "",
         environment: Callable[[], Any] | None = None,
+        interface: Interface | None = None,
     ):
         """Make a policy of an agent and one of its trained states.
 
         `seed` is the random seed of sampled actions, `precision` that of matrix products (`Run.precision`), `task` a
         name for `repr`. `environment` makes an environment as the agent sees it, to check an ONNX export in.
+        `interface` has the names of the observed entries and the bounds of the actions, which an ONNX file records.
         """
         self.agent, self.spec, self.seed, self.precision, self.task = agent, spec, seed, precision, task
-        self.environment = environment
+        self.environment, self.interface = environment, interface
         self._state = jax.device_put(state)
         self._empty = jax.device_get(agent.reset(spec))  # the memory at the start of an episode
         self._act = jax.jit(lambda *inputs: self._step(self._state, *inputs))
@@ -108,7 +111,7 @@ class Policy:
     def predict(
         self,
         obs: Any,
-        reward: Any = 0.0,
+        reward: Any = None,
         state: Any = None,
         episode_start: Any = None,
         deterministic: Any = True,
@@ -117,7 +120,8 @@ class Policy:
 
         Args:
             obs: o_t, (obs,) or (batch, obs).
-            reward: r_{t-1}, which came with `obs`, a number or (batch,); ignored at the start of an episode.
+            reward: r_{t-1}, which came with `obs`, a number or (batch,); ignored at the start of an episode. It may be
+                left out there, and always if the agent does not observe it (`sac-mlp`).
             state: the state that the previous call returned; None at the start of all episodes.
             episode_start: whether an episode starts with `obs`, a bool or (batch,); None: True if `state` is None.
             deterministic: True takes the policy's mode, False samples the action.
@@ -127,9 +131,9 @@ class Policy:
 
         Raises:
             UserError: an input has the wrong shape or type, is not finite as float32, or is so large that the action
-                would not be finite. `state` stays valid.
+                would not be finite, or the reward is missing. `state` stays valid.
         """
-        obs = given = _numbers(obs, "obs")
+        obs = given = numbers(obs, "obs")
         single = obs.ndim == 1
         obs = obs[None] if single else obs
         if obs.ndim != 2 or obs.shape[1] != self.spec.obs_dim:
@@ -138,22 +142,32 @@ class Policy:
         batch = len(obs)
         if not batch:
             raise UserError("obs has no episodes: give one or more.")
-        starts = _flags(state is None if episode_start is None else episode_start, batch, "episode_start")
-        reward = _each(_numbers(reward, "reward"), batch, "reward")
+        starts = flags(state is None if episode_start is None else episode_start, batch, "episode_start")
+        is_missing = reward is None and not starts.all()
+        reward = each(numbers(0.0 if reward is None else reward, "reward"), batch, "reward")
         reward = np.where(starts, 0, reward)
-        _check_finite(given, "obs")
-        _check_finite(reward.reshape(() if single else batch), "reward")
+        check_finite(given, "obs")
+        check_finite(reward.reshape(() if single else batch), "reward")
         state = self.initial_state(batch) if state is None else self._fitting(state, batch)
-        (mode,) = _flags(deterministic, 1, "deterministic")
+        (mode,) = flags(deterministic, 1, "deterministic")
         self._calls += 1
         seed = np.uint32((self.seed * 1_000_003 + self._calls) % (LARGEST + 1))
         obs, reward = obs.astype(np.float32), reward.astype(np.float32)
         action, after = jax.device_get(self._act(obs, reward, state, starts, seed, mode))
+        if is_missing:
+            other = jax.device_get(self._act(obs, reward + np.float32(1), state, starts, seed, mode))
+            self._check_unused(after, other[1])
         finite = np.all([np.isfinite(leaf.reshape(batch, -1)).all(axis=1) for leaf in after], axis=0)
         for episode in np.flatnonzero(~finite):
             which = "" if single else f" of episode {episode}"
             raise UserError(f"obs or reward{which} is too large for this policy: its action would not be finite.")
         return (action[0] if single else action), after
+
+    def _check_unused(self, after: State, other: State) -> None:
+        """Raise a UserError if two states differ that followed on different rewards."""
+        if not all(np.array_equal(a, b, equal_nan=True) for a, b in zip(after, other, strict=True)):
+            name = agents.name_of(self.agent)
+            raise UserError(f"reward is missing: {name} observes it. Give the reward that came with obs.")
 
     def _fitting(self, state: Any, batch: int) -> State:
         """The same state, after a check that it is a state of this policy for `batch` episodes."""
@@ -195,7 +209,8 @@ class Policy:
         if path.exists() and not overwrite:
             raise UserError(f"{path} exists already: choose another file, or replace it with overwrite (--overwrite).")
         if path.suffix.lower() == ".onnx":
-            in_float32 = Policy(self.agent, self.spec, self._state, task=self.task, seed=self.seed)
+            sizes = self.agent, self.spec, self._state
+            in_float32 = Policy(*sizes, task=self.task, seed=self.seed, interface=self.interface)
             content, difference = onnx.export(in_float32, self.environment)
         else:
             content, difference = self._for_jax(), None
@@ -225,7 +240,8 @@ def load(
     Args:
         run: a run, or its folder.
         seed: one of the run's seeds; None: its first.
-        task: needed only if the run was trained on a task of your own: that task, or the class of its environments.
+        task: needed only if the run was trained on a task of your own in JAX: that task. Of a Gymnasium environment the
+            run has the sizes, and no environment is made.
         agent: needed only if the run was trained by an agent of your own: its class, or an instance.
         best: take the seed's best agent, not its last one; see `evaluate`.
 
@@ -233,57 +249,20 @@ def load(
         UserError: there is no such run or seed, or the run has no trained agent yet.
     """
     run = run if isinstance(run, Run) else Run(run)
-    trained, found, state, precision = restore_seed(run, seed, task, agent, best)
+    trained, spec, interface, state = restore_policy(run, seed, task, agent, best)
+    environment = None if run.options.share_env else lambda: _environment(run, task)
     seed = run.seeds[0] if seed is None else seed
-    environment = found.environment if isinstance(found, GymnasiumTask) else lambda: TaskEnvironment(found)
-    return Policy(trained, found.spec, state, seed, precision, run.config["task"], environment)
+    return Policy(trained, spec, state, seed, run.precision, run.config["task"], environment, interface)
 
 
-def _numbers(value: Any, name: str) -> np.ndarray:
-    """The value of obs or reward as an array of real numbers.
+def _environment(run: Run, task: Any) -> Any:
+    """An environment of the run's task, as the agent sees it.
 
     Raises:
-        UserError: an entry is not a number.
+        UserError: it cannot be made.
     """
-    if isinstance(value, dict):
-        raise UserError(f"{name} is a dictionary: give one flat array, with the entries that the agent observes.")
-    array = as_array(value)
-    for index, entry in np.ndenumerate(array if array.dtype == object else ()):
-        if not isinstance(entry, Real):
-            raise UserError(f"{_place(name, index)} is {short(entry)}: give finite numbers.")
-    if array.dtype.kind not in "iuf":
-        raise UserError(f"{name} must be real numbers, not {short(value)}: the arguments are obs, reward, state.")
-    return array
-
-
-def _flags(value: Any, batch: int, name: str) -> np.ndarray:
-    """One bool for each episode of a batch."""
-    array = as_array(value)
-    if array.dtype.kind not in "biu" or not np.isin(array, (0, 1)).all():
-        raise UserError(f"{name} must be True or False, not {short(value)}.")
-    return _each(array.astype(bool), batch, name)
-
-
-def _each(array: np.ndarray, batch: int, name: str) -> np.ndarray:
-    """One entry for each episode of a batch."""
-    if array.shape not in ((), (batch,)):
-        raise UserError(f"{name} has the shape {array.shape}: it must be one number or ({batch},).")
-    return np.broadcast_to(array, (batch,))
-
-
-def _check_finite(array: np.ndarray, name: str) -> None:
-    """Raise a UserError that names the first entry which is not finite as float32."""
-    with np.errstate(over="ignore"):
-        wrong = ~np.isfinite(array.astype(np.float32))
-    for index in map(tuple, np.argwhere(wrong).tolist()):
-        raise UserError(f"{_place(name, index)} is {array[index]}: give finite numbers, within float32.")
-
-
-def _place(name: str, index: tuple[int, ...]) -> str:
-    """The position of an entry as text; `index` is (entry,) or (episode, entry) of obs, () or (episode,) of reward."""
-    *episode, entry = index if name == "obs" and index else (*index, None)
-    which = name if entry is None else f"entry {entry} of {name}"
-    return f"{which} of episode {episode[0]}" if episode else which
+    found = task_of(run, task)
+    return found.environment() if isinstance(found, GymnasiumTask) else TaskEnvironment(found)
 
 
 def _where_first(is_first: Any, empty: Any, leaf: Any) -> Any:

@@ -9,7 +9,9 @@ The first state may be zeros, since the state is ignored where episode_start is 
 The packages onnx and onnxruntime are an extra of this library, imported when they are needed.
 """
 
+import contextlib
 import importlib
+import json
 from collections.abc import Callable
 from typing import Any
 
@@ -28,7 +30,10 @@ def export(policy: Any, environment: Callable[[], Any] | None = None) -> tuple[b
 
     They are compared in onnxruntime at every timestep of an episode of at most 200 steps: each action, and each number
     of the next state, relative to its size if that is more than 1. The episode is played in an environment that
-    `environment` makes. If it is None, observations and rewards are random.
+    `environment` makes. If it is None, or if none can be made here, observations and rewards are random.
+
+    The metadata of the model have a description of the policy, and of a Gymnasium environment the names of the observed
+    entries and the bounds of the actions, as lists in JSON.
 
     Raises:
         UserError: a package is missing, the agent uses a primitive that is not supported, or the difference is more
@@ -46,14 +51,22 @@ def export(policy: Any, environment: Callable[[], Any] | None = None) -> tuple[b
         **{name: (part.shape[1:], part.dtype) for name, part in parts.items()},
     }
     outputs = ["action", *(f"next_{name}" for name in parts)]
-    content = model(onnx, policy.mode, inputs, outputs, {"policy": repr(policy)})
-    difference = _difference(policy, runtime, content, environment() if environment else _MadeUp(policy.spec.obs_dim))
+    interface = {} if policy.interface is None else policy.interface._asdict()
+    about = {"policy": repr(policy), **{name: json.dumps(value) for name, value in interface.items()}}
+    content = model(onnx, policy.mode, inputs, outputs, about)
+    difference = _difference(policy, runtime, content, _made(environment) or _MadeUp(policy.spec.obs_dim))
     if not difference <= LARGEST_DIFFERENCE:
         raise UserError(
             f"The ONNX model differs from the policy by {difference:.1g}, more than {LARGEST_DIFFERENCE:.0e}: export "
             "the policy as a .jax file."
         )
     return content, difference
+
+
+def _made(environment: Callable[[], Any] | None) -> Any:
+    """An environment, or None if there is none here."""
+    with contextlib.suppress(UserError):
+        return environment and environment()
 
 
 def _difference(policy: Any, runtime: Any, content: bytes, environment: Any) -> float:

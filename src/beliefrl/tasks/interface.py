@@ -20,22 +20,31 @@ class Interface(NamedTuple):
     low: list[float]  # of each action
     high: list[float]
 
+    @classmethod
+    def recorded(cls, value: Any) -> "Interface | None":
+        """The interface that a run has recorded; None in a run from before there was one."""
+        lists: list[Any] = [value.get(name) for name in cls._fields] if isinstance(value, dict) else []
+        if len(lists) < len(cls._fields) or not all(isinstance(each, list) for each in lists):
+            return None
+        return cls(tuple(map(str, lists[0])), lists[1], lists[2])
+
     def check(self, before: Any, folder: str) -> None:
         """Raise a UserError if it differs from the one that a run has recorded. An entry without a name fits any."""
-        if not (isinstance(before, dict) and set(self._fields) <= set(before)):
-            return  # an older run
-        known = zip(before["entries"], self.entries, strict=False)
+        old = Interface.recorded(before)
+        if old is None:
+            return
+        known = zip(old.entries, self.entries, strict=False)
         named = [pair for pair in known if not any(str(name).startswith(UNNAMED) for name in pair)]
-        for what, old, new in (
-            ("number of observed entries", len(before["entries"]), len(self.entries)),
-            ("observed entries", [old for old, _ in named], [new for _, new in named]),
-            ("lower bounds of the actions", before["low"], self.low),
-            ("upper bounds of the actions", before["high"], self.high),
+        for what, then, now in (
+            ("number of observed entries", len(old.entries), len(self.entries)),
+            ("observed entries", [then for then, _ in named], [now for _, now in named]),
+            ("lower bounds of the actions", old.low, self.low),
+            ("upper bounds of the actions", old.high, self.high),
         ):
-            if old != new:
+            if then != now:
                 raise UserError(
-                    f"{folder} was trained in another environment: {what} before: {short(old)}, now: "
-                    f"{short(new)}. Give the environment of the training, or train again."
+                    f"{folder} was trained in another environment: {what} before: {short(then)}, now: "
+                    f"{short(now)}. Give the environment of the training, or train again."
                 )
 
 

@@ -46,13 +46,21 @@ def observe(task: Any, indices: tuple[int, ...]) -> Any:
     task = as_task(task)
     if faults_of(task) != NONE:
         raise UserError("The task has faults already: select the entries first, then add the faults (with_faults).")
-    check_indices(indices, task.spec.obs_dim)
     if isinstance(task, GymnasiumTask):
-        seen = range(task.spec.obs_dim) if task.indices is None else task.indices
-        return dataclasses.replace(task, indices=tuple(seen[i] for i in indices))
+        return _observe_host(task, indices)
+    check_indices(indices, task.spec.obs_dim)
     if isinstance(task, Observed):  # one selection: `describe` records one
         return Observed(task.task, tuple(task.indices[i] for i in indices))
     return Observed(task, tuple(indices))
+
+
+def _observe_host(task: GymnasiumTask, indices: tuple[int, ...]) -> GymnasiumTask:
+    if task.indices is not None:
+        check_indices(indices, len(task.indices))
+        indices = tuple(task.indices[i] for i in indices)
+    chosen = dataclasses.replace(task, indices=tuple(indices))
+    _ = chosen.spec  # checks them, in the only environment that is made: it may be a robot
+    return chosen
 
 
 def with_faults(task: Any, faults: Faults | Mapping[str, Any] | None) -> Any:

@@ -15,15 +15,17 @@ from beliefrl.imports import path
 from beliefrl.runs.options import MOST_EPISODES
 from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
+from beliefrl.tasks.faults import Faults
 from beliefrl.tasks.given import given
 from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.tasks.interface import Interface
 from beliefrl.training.checks import about_task
 from beliefrl.training.compilation import keep_compiled
 from beliefrl.training.host_evaluation import Evaluation
 from beliefrl.training.lockstep import Lockstep
 from beliefrl.training.phases import evaluate as evaluate_seed
 from beliefrl.training.rollout import Episode
-from beliefrl.types import UserError, check_whole, one_line, tuples
+from beliefrl.types import LARGEST, Spec, UserError, check_whole, one_line, tuples
 
 MODES = ("sampled", "mode")  # how actions are chosen; the second axis of an evaluation's leaves, after that of seeds
 
@@ -65,11 +67,14 @@ def restore(
     """
     made = agent_of(run, agent)
     found = task_of(run, task)
-    spec = found.spec
     check_interface(run, found)
+    return made, found, _states(run, made, found.spec, best), run.precision
+
+
+def _states(run: Run, agent: Agent, spec: Spec, best: bool) -> Any:
     keys = jax.random.split(jax.random.key(0), len(run.seeds))
-    like = jax.eval_shape(jax.vmap(lambda key: made.networks(made.init(key, spec))), keys)
-    return made, found, run.load(like, best), run.precision
+    like = jax.eval_shape(jax.vmap(lambda key: agent.networks(agent.init(key, spec))), keys)
+    return run.load(like, best)
 
 
 def check_interface(run: Run, task: Any) -> None:
@@ -91,11 +96,47 @@ def restore_seed(
         UserError: there is no such run, nothing was saved in it, or it has no such seed.
     """
     run = run if isinstance(run, Run) else Run(run)
-    seed = run.seeds[0] if seed is None else seed
-    if seed not in run.seeds:
-        raise UserError(f"{run.folder} has no seed {seed}: it has {', '.join(map(str, run.seeds))}.")
+    _check_seed(run, seed)
     made, found, states, precision = restore(run, task, agent, best)
-    return made, found, jax.tree.map(lambda leaf: leaf[run.seeds.index(seed)], states), precision
+    return made, found, _of_seed(run, states, seed), precision
+
+
+def restore_policy(
+    run: Run,
+    seed: int | None = None,
+    task: Task | GymnasiumTask | type | None = None,
+    agent: Agent | type | None = None,
+    best: bool = False,
+) -> tuple[Agent, Spec, Interface | None, Any]:
+    """The agent of a run, the sizes of its task, the interface of a Gymnasium environment, and the state of a seed.
+
+    Nothing is made if the run records the interface: the robot may be somewhere else, and must not move.
+
+    Raises:
+        UserError: as `restore_seed`.
+    """
+    _check_seed(run, seed)
+    made, interface = agent_of(run, agent), Interface.recorded(run.config.get("interface"))
+    if task is not None or interface is None:
+        found = task_of(run, task)
+        check_interface(run, found)
+        spec, interface = found.spec, found.interface if isinstance(found, GymnasiumTask) else None
+    else:
+        with _naming(run):
+            observed = Faults.of(run.config.get("faults")).observed_size(len(interface.entries))
+        spec = Spec(observed, len(interface.low), LARGEST)
+    return made, spec, interface, _of_seed(run, _states(run, made, spec, best), seed)
+
+
+def _check_seed(run: Run, seed: int | None) -> None:
+    """Raise a UserError if the run does not have this seed; None is its first."""
+    if seed is not None and seed not in run.seeds:
+        raise UserError(f"{run.folder} has no seed {seed}: it has {', '.join(map(str, run.seeds))}.")
+
+
+def _of_seed(run: Run, states: Any, seed: int | None) -> Any:
+    index = 0 if seed is None else run.seeds.index(seed)
+    return jax.tree.map(lambda leaf: leaf[index], states)
 
 
 def agent_of(run: Run, agent: Agent | type | None = None) -> Agent:

@@ -232,11 +232,16 @@ def capacity(agent: Agent, options: Options, taken_timesteps: int = 0) -> int:
 
 
 def _processes(options: Options, own_process: bool) -> Processes:
-    """Whether environments have processes of their own; "auto" depends on the program and on a time limit."""
+    """Whether environments have processes of their own; "auto" depends on the program and on a time limit.
+
+    Shared environments may be robots. The measurement of "auto" would move them, so there is none.
+    """
     if options.processes != "auto":
         return options.processes
     if not own_process:
         return "never"
+    if options.share_env:
+        return "always" if options.seeds > 1 or options.step_timeout is not None else "never"
     return "auto" if options.step_timeout is None else "always"
 
 

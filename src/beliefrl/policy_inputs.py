@@ -1,0 +1,55 @@
+"""Checks of what a user passes to `Policy.predict`."""
+
+from numbers import Real
+from typing import Any
+
+import numpy as np
+
+from beliefrl.types import UserError, as_array, short
+
+
+def numbers(value: Any, name: str) -> np.ndarray:
+    """The value of obs or reward as an array of real numbers.
+
+    Raises:
+        UserError: an entry is not a number.
+    """
+    if isinstance(value, dict):
+        raise UserError(f"{name} is a dictionary: give one flat array, with the entries that the agent observes.")
+    array = as_array(value)
+    for index, entry in np.ndenumerate(array if array.dtype == object else ()):
+        if not isinstance(entry, Real):
+            raise UserError(f"{_place(name, index)} is {short(entry)}: give finite numbers.")
+    if array.dtype.kind not in "iuf":
+        raise UserError(f"{name} must be real numbers, not {short(value)}: the arguments are obs, reward, state.")
+    return array
+
+
+def flags(value: Any, batch: int, name: str) -> np.ndarray:
+    """One bool for each episode of a batch."""
+    array = as_array(value)
+    if array.dtype.kind not in "biu" or not np.isin(array, (0, 1)).all():
+        raise UserError(f"{name} must be True or False, not {short(value)}.")
+    return each(array.astype(bool), batch, name)
+
+
+def each(array: np.ndarray, batch: int, name: str) -> np.ndarray:
+    """One entry for each episode of a batch."""
+    if array.shape not in ((), (batch,)):
+        raise UserError(f"{name} has the shape {array.shape}: it must be one number or ({batch},).")
+    return np.broadcast_to(array, (batch,))
+
+
+def check_finite(array: np.ndarray, name: str) -> None:
+    """Raise a UserError that names the first entry which is not finite as float32."""
+    with np.errstate(over="ignore"):
+        wrong = ~np.isfinite(array.astype(np.float32))
+    for index in map(tuple, np.argwhere(wrong).tolist()):
+        raise UserError(f"{_place(name, index)} is {array[index]}: give finite numbers, within float32.")
+
+
+def _place(name: str, index: tuple[int, ...]) -> str:
+    """The position of an entry as text; `index` is (entry,) or (episode, entry) of obs, () or (episode,) of reward."""
+    *episode, entry = index if name == "obs" and index else (*index, None)
+    which = name if entry is None else f"entry {entry} of {name}"
+    return f"{which} of episode {episode[0]}" if episode else which
