@@ -1,5 +1,6 @@
 """Faulty environments, one for each kind of fault."""
 
+import multiprocessing
 import os
 import pathlib
 import signal
@@ -7,6 +8,7 @@ import sys
 import time
 
 import gymnasium
+import jax
 import numpy as np
 from gymnasium import spaces
 
@@ -233,3 +235,45 @@ class Closing(Fine):
     def close(self):
         if getattr(self, "time", 0):
             (self.folder / f"closed-{os.getpid()}-{id(self)}").touch()
+
+
+class WithChild(Fine):
+    """Starts a process of its own, as some simulators do."""
+
+    def reset(self, *, seed=None, options=None):
+        child = multiprocessing.get_context("spawn").Process(target=print)
+        child.start()
+        child.join()
+        return super().reset(seed=seed, options=options)
+
+
+class Single(Fine):
+    """There can be one at a time in a process."""
+
+    is_there = False
+
+    def __init__(self):
+        if Single.is_there:
+            raise RuntimeError("only one simulation per process")
+        Single.is_there = True
+        super().__init__()
+
+    def close(self):
+        Single.is_there = False
+
+
+class OnlyHere(Fine):
+    """Cannot be made in another process."""
+
+    def __init__(self):
+        if multiprocessing.parent_process() is not None:
+            raise OSError("the port is in use")
+        super().__init__()
+
+
+class Wide(Fine):
+    """Switches JAX to 64 bits when it is made."""
+
+    def __init__(self):
+        jax.config.update("jax_enable_x64", True)
+        super().__init__()

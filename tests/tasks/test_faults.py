@@ -12,7 +12,8 @@ from beliefrl import TaskEnvironment, cli, evaluate, load, play, task_of, tasks,
 from beliefrl.runs.run import Run
 from beliefrl.tasks import make, observe, with_faults
 from beliefrl.tasks.faults import Faults
-from beliefrl.tasks.gymnasium import Environment, GymnasiumTask
+from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.tasks.seen_environment import Environment
 from beliefrl.types import Spec, UserError
 from worlds import Counter, Counting, saved, tiny
 

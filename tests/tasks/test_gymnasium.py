@@ -13,9 +13,10 @@ from gymnasium import spaces
 
 from beliefrl import catalogue, tasks
 from beliefrl.errors import Fault
-from beliefrl.tasks import gymnasium as adapter
+from beliefrl.tasks import seen_environment
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.interface import Interface
+from beliefrl.tasks.registered import _Registered
 from beliefrl.training.lockstep import Lockstep
 from beliefrl.types import UserError
 from wrong import BOX, FAULTS, UNSUPPORTED, Dictionary, Fine, observing, spaced
@@ -40,7 +41,7 @@ def test_what_is_not_supported_is_refused_before_anything_begins(make):
 
 @pytest.mark.parametrize("make", FAULTS, ids=lambda make: FAULTS[make][0])
 def test_a_fault_names_the_environment_the_seed_and_the_step(make, monkeypatch):
-    monkeypatch.setattr(adapter, "ENDLESS", 25)
+    monkeypatch.setattr(seen_environment, "ENDLESS", 25)
     phrase, step = FAULTS[make]
     lanes = Lockstep(GymnasiumTask(make, "robot"), ["seed 4"])
     with pytest.raises(Fault) as error:  # noqa: PT012 - it may come at any of them
@@ -312,7 +313,7 @@ def test_an_environment_of_ones_own_is_never_recorded_as_one_of_our_tasks():
 
 
 def test_a_selection_of_a_selection_is_recorded_as_entries_of_the_full_observation():
-    robot = GymnasiumTask(Fine, "hopper-v", indices=catalogue.ROBOTS["hopper"].velocities)
+    robot = GymnasiumTask(_Registered("any"), "hopper-v", indices=catalogue.ROBOTS["hopper"].velocities)
     one = dataclasses.replace(robot, indices=(robot.indices[1],))  # as observe=[1] does
     assert tasks.describe(one)["task"] == "hopper"
     assert tasks.describe(one)["observe"] == [4]
@@ -371,3 +372,75 @@ def test_a_measure_keeps_the_value_that_was_reported_last():
     assert [each["distance"] for each in seen] == [0, 0, 0.5, 0.5, 0.5]
     environment.reset(seed=0)
     assert environment.step(np.zeros(1))[-1] == {"success": 0, "distance": 0}
+
+
+@pytest.mark.parametrize("name", ["step", "kind", "return", "length", "mean", "sem", "seeds", "seeds_height"])
+def test_a_measure_cannot_replace_a_number_of_the_library(name):
+    with pytest.raises(UserError, match=f"a measure '{name}', which every run has: choose another name"):
+        GymnasiumTask(Fine, measures=(name,))
+
+
+def test_an_environment_may_change_the_array_of_its_action():
+    seen = []
+
+    class Halving(Fine):
+        def step(self, action):
+            seen.append(float(action[0]))
+            action *= 0.5
+            return super().step(action)
+
+    environment = GymnasiumTask(Halving, steps_per_action=3).environment()
+    environment.reset(seed=0)
+    environment.step(np.array([0.5], np.float32))
+    assert seen == [4.0, 4.0, 4.0]
+
+
+def test_an_explicit_name_of_ours_is_not_recorded_as_our_task():
+    assert GymnasiumTask(Fine, "pendulum").name == "wrong:pendulum"
+    assert tasks.make("gym:Pendulum-v1").name == "gym:Pendulum-v1"
+
+
+def test_the_exit_of_an_environment_that_is_made_is_one_sentence():
+    def leave():
+        raise SystemExit("no robot found")
+
+    with pytest.raises(UserError, match="cannot be made: SystemExit: no robot found"):
+        _ = GymnasiumTask(leave).spec
+
+
+@pytest.mark.parametrize(
+    ("space", "obs"),
+    [
+        (spaces.Box(0, 255, (2,), np.uint8), [300.0, -1.0]),
+        (spaces.Box(0, 255, (2,), np.uint8), [0.5, 1.0]),
+        (spaces.Box(0, 255, (2,), np.uint8), [np.nan, 1.0]),
+        (spaces.Box(-1.0, 1.0, (2,), np.float32), [0.1, 0.2, 0.3]),
+        (spaces.Box(-1.0, 1.0, (2,), np.float32), ["0.1", "0.2"]),
+    ],
+)
+def test_a_part_of_an_observation_is_not_cast_to_its_space(space, obs):
+    class Parts(Fine):
+        observation_space = spaces.Dict({"a": space, "b": BOX})
+
+        def observe(self):
+            return {"a": obs, "b": np.ones(2 if len(obs) == 2 else 1, np.float32)}
+
+    with pytest.raises(UserError, match="the observation does not fit its space"):
+        GymnasiumTask(Parts).environment().reset(seed=0)
+
+
+def test_integers_in_a_part_may_have_another_type():
+    class Parts(Fine):
+        observation_space = spaces.Dict({"a": spaces.Box(0, 255, (2,), np.uint8)})
+
+        def observe(self):
+            return {"a": [3, 200]}
+
+    np.testing.assert_array_equal(GymnasiumTask(Parts).environment().reset(seed=0)[0], [3, 200])
+
+
+def test_bounds_whose_distance_is_not_finite_are_no_bounds():
+    largest = np.finfo(np.float64).max
+    space = spaces.Box(-largest, largest, (1,), np.float64)
+    with pytest.raises(UserError, match="unbounded actions"):
+        _ = GymnasiumTask(spaced(action_space=space)).spec

@@ -1,18 +1,22 @@
 """A training that starts with the replay of another run."""
 
+import json
 import shutil
 
 import jax
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 from beliefrl import UserError, resume, tasks, train
 from beliefrl.runs import arrays
 from beliefrl.runs.checkpoint import Checkpoints, listed
 from beliefrl.runs.options import Options
+from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import initial_replay, replay, schedule
 from beliefrl.types import StoredTimestep, Timestep
 from worlds import saved, tiny
+from wrong import Fine
 
 TASK = tasks.make("pendulum-v")
 AGENT = tiny("sac-mlp", step_start_rl=20, batch_size=8, pretrain_updates=5)
@@ -163,3 +167,14 @@ def test_a_training_goes_on_from_it_and_needs_the_other_run_no_more(tmp_path):
     assert not (run.folder / "results.json").exists()
     resume(run, progress=False)
     assert agent.read_bytes() == whole
+
+
+def test_actions_with_other_bounds_are_one_sentence(tmp_path):
+    run = written(tmp_path / "source", capacity=20, added=(7, 12))
+    wide = spaces.Box(-9.0, 9.0, (1,), np.float32)
+    task = GymnasiumTask(type("Fine", (Fine,), {"action_space": wide}))
+    config = json.loads((run.folder / "config.json").read_text()) | tasks.describe(task)
+    config["interface"] = GymnasiumTask(Fine).interface._asdict()
+    (run.folder / "config.json").write_text(json.dumps(config))
+    with pytest.raises(UserError, match=r"another environment: lower bounds of the actions before: \[-2.0\]"):
+        initial_replay.taken(Options(init_from=str(run.folder)), AGENT, task, [0])

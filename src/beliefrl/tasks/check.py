@@ -15,7 +15,8 @@ from rich.text import Text
 from beliefrl import tasks
 from beliefrl.tasks.environment import TaskEnvironment
 from beliefrl.tasks.given import given
-from beliefrl.tasks.gymnasium import ENDLESS, GymnasiumTask
+from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.tasks.seen_environment import ENDLESS
 from beliefrl.tasks.spaces import action_names, check_actions, check_names, flat_bounds, flat_size, observation_names
 from beliefrl.types import LARGEST, UserError, check_whole, short
 
@@ -255,7 +256,7 @@ def _about_episodes(found: TaskCheck, rewards: Sequence[float], truncates: bool)
     if found.max_steps is None and not truncates:
         sentences.append(
             f"There is no time limit: an episode of more than {ENDLESS:,} steps stops the training; set one with "
-            "--constants max_episode_steps=500."
+            "--constants max_episode_steps=500, or in Python with GymnasiumTask(..., max_steps=500)."
         )
     return sentences
 

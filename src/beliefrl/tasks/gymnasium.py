@@ -1,7 +1,7 @@
 """Any Gymnasium environment as a task: flat and masked observations, actions in [-1, 1], and clear messages for faults.
 
 Such a task runs on the host, not in a compiled program (`host_loop`). It has a `spec`, and makes environments whose
-episodes follow the same rules as those of `rollout`. This module checks everything that an environment returns.
+episodes follow the same rules as those of `rollout` (`seen_environment`).
 """
 
 import contextlib
@@ -13,18 +13,13 @@ from typing import Any
 
 import gymnasium
 import jax
-import numpy as np
-from gymnasium import spaces
 
 from beliefrl.catalogue import our_task_names
-from beliefrl.errors import Fault
-from beliefrl.tasks.faults import NONE, STREAM, Draws, Faults
-from beliefrl.tasks.interface import Interface, interface_of, measure_of
-from beliefrl.tasks.repeat import LONGEST, actions
-from beliefrl.tasks.spaces import check_actions, fits, flat_bounds, flat_size, limits, scale
-from beliefrl.types import LARGEST, Spec, UserError, as_array, check_indices, check_range, said, short
-
-ENDLESS = 10_000  # steps after which an episode without a time limit is considered endless
+from beliefrl.tasks.faults import NONE, Faults
+from beliefrl.tasks.interface import Interface, check_measures, interface_of
+from beliefrl.tasks.repeat import LONGEST
+from beliefrl.tasks.seen_environment import Environment, FaultyEnvironment
+from beliefrl.types import LARGEST, Spec, UserError, check_range, said, short
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -54,14 +49,14 @@ class GymnasiumTask:
             raise UserError(f"GymnasiumTask needs a class or function that makes environments, not {short(self.make)}.")
         if isinstance(self.measures, str):
             raise UserError(f"measures={self.measures!r} is a text: give a tuple, ({self.measures!r},).")
+        check_measures(self.measures, "The task")
         if self.max_steps is not None:
             check_range(self, ("max_steps",), 1)
         check_range(self, ("steps_per_action",), 1, LONGEST)
-        if not self.name:
-            name = getattr(self.make, "__qualname__", type(self.make).__name__)
-            if name in our_task_names():  # a run would be opened with that task
-                name = f"{self.make.__module__}:{name}"
-            object.__setattr__(self, "name", name)
+        name = self.name or getattr(self.make, "__qualname__", type(self.make).__name__)
+        if name in our_task_names() and not hasattr(self.make, "id"):  # a run would be opened with that task
+            name = f"{self.make.__module__}:{name}"
+        object.__setattr__(self, "name", name)
 
     @cached_property
     def _seen(self) -> tuple[Spec, Interface]:
@@ -93,7 +88,7 @@ class GymnasiumTask:
         """The name of each entry that the agent sees; raises as `spec`."""
         return self.interface.entries
 
-    def environment(self, seed: str = "") -> "Environment":
+    def environment(self, seed: str = "") -> Environment:
         """Make one environment, as the agent sees it. `seed` identifies it in error messages.
 
         Raises:
@@ -112,189 +107,5 @@ class GymnasiumTask:
             return self.make(**self.arguments)
         except UserError:
             raise
-        except Exception as error:  # an environment may raise anything
-            raise UserError(f"{self.name} cannot be made: {said(error)}.") from None
-
-
-class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
-    """A Gymnasium environment as the agent sees it: the entries it observes, float32, and actions in [-1, 1].
-
-    Any error inside the environment becomes a Fault that names the environment, the seed and the step.
-    """
-
-    def __init__(self, task: GymnasiumTask, seed: str = ""):
-        """Make the environment and check its spaces."""
-        self.task, self.seed = task, seed
-        self.steps, self.length = 0, 0  # actions in total, and steps of the environment in this episode
-        self._measured: dict[str, float] = {}  # in this episode
-        self.inner = task.bare()
-        self.inner_action_space: Any = getattr(self.inner, "action_space", None)
-        self.inner_observation_space: Any = getattr(self.inner, "observation_space", None)
-        check_actions(self.inner_action_space, task.name)
-        self._size = flat_size(self.inner_observation_space, task.name)
-        if task.indices is not None:
-            check_indices(task.indices, self._size)
-        self.indices = np.arange(self._size) if task.indices is None else np.array(task.indices)
-        self.whole = np.full(self._size, np.nan)  # the newest observation with all of its entries, as returned
-        self._lowest, self._highest = limits(self.inner_observation_space, self.indices)
-        self.observation_space = spaces.Box(-np.inf, np.inf, (self.indices.size,), np.float32)
-        self.action_space = spaces.Box(-1.0, 1.0, (self.inner_action_space.low.size,), np.float32)
-        registered = getattr(self.inner, "spec", None)
-        self._longest = task.max_steps or (registered.max_episode_steps if registered else None)  # of its own steps
-        self.limit = self._longest and actions(self._longest, task.steps_per_action)  # of the agent's
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode."""
-        self.length, self._measured = 0, {}
-        result = self._call("reset", lambda: self.inner.reset(seed=seed, options=options or None))
-        if not (isinstance(result, tuple) and len(result) == 2):
-            raise self._fault("reset did not return (observation, info)")
-        return self._seen(result[0]), {}
-
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Apply an action in [-1, 1]."""
-        self.steps, scaled = self.steps + 1, scale(self.inner_action_space, action)
-        obs, total, terminated, truncated, info = self._step(scaled)
-        for _ in range(self.task.steps_per_action - 1):
-            if terminated or truncated:
-                break
-            obs, reward, terminated, truncated, info = self._step(scaled)
-            total += reward
-        return obs, total, terminated, truncated, info
-
-    def _step(self, scaled: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        self.length += 1
-        result = self._call("step", lambda: self.inner.step(scaled))
-        if not (isinstance(result, tuple) and len(result) == 5):
-            raise self._fault("step did not return (observation, reward, terminated, truncated, info)")
-        obs, reward, terminated, truncated, info = result
-        obs, reward = self._seen(obs), self._number(reward)
-        terminated, truncated = self._flag(terminated, "terminated"), self._flag(truncated, "truncated")
-        truncated = truncated or self.length == self.task.max_steps
-        if not (terminated or truncated) and self.length >= (self._longest or ENDLESS):
-            raise self._fault(
-                f"the episode has not ended after {self.length} steps: fix the environment, or give it a time limit "
-                "with max_episode_steps"
-            )
-        return obs, reward, terminated, truncated, self._measures(info, terminated or truncated)
-
-    def _measures(self, info: Any, ended: bool) -> dict[str, Any]:
-        """The task's measures as the infos of this episode reported them last; 0 before. Success may be missing."""
-        for name in self.task.measures:
-            value = measure_of(info, name)
-            if value is not None:
-                self._measured[name] = value
-            elif ended and name not in ("success", *self._measured):
-                raise self._fault(f"no info of an episode has a number {name!r}, which the task measures")
-        return dict.fromkeys(self.task.measures, 0.0) | self._measured
-
-    def render(self) -> Any:
-        """The picture that the environment renders."""
-        return self.inner.render()
-
-    def close(self) -> None:
-        """Close the environment, ignoring errors."""
-        with contextlib.suppress(Exception):
-            self.inner.close()
-
-    def _fault(self, what: str) -> Fault:
-        seed = f"{self.seed}, " if self.seed else ""
-        return Fault(f"{self.task.name} ({seed}step {self.steps}): {what}.")
-
-    def _call(self, name: str, function: Callable[[], Any]) -> Any:
-        try:
-            result = function()
         except (Exception, SystemExit) as error:  # an environment may raise anything
-            raise self._fault(f"{name} raised {said(error)}") from None
-        space = self.inner.action_space
-        if space is not self.inner_action_space and space != self.inner_action_space:
-            raise self._fault(
-                f"its action space changed from {short(self.inner_action_space)} to {short(space)}, but must not change"
-            )
-        return result
-
-    def _seen(self, obs: Any) -> np.ndarray:
-        """The entries that the agent observes, as float32, after all checks."""
-        space = self.inner_observation_space
-        if isinstance(space, spaces.Box):
-            value = as_array(obs)
-            if value.dtype.kind not in "biuf":
-                raise self._fault(f"the observation has type {value.dtype}, but its space says {space.dtype}")
-            if value.shape != space.shape:
-                raise self._fault(f"the observation has shape {value.shape}, but its space says {space.shape}")
-        else:
-            try:
-                value = np.asarray(spaces.flatten(space, obs)) if fits(space, obs) else np.empty(0)
-            except Exception:
-                raise self._fault(f"the observation does not fit its space {short(space)}") from None
-            if value.shape != (self._size,):
-                raise self._fault(f"the observation does not fit its space {short(space)}")
-        self.whole = value.reshape(-1)
-        with np.errstate(over="ignore"):
-            flat = self.whole[self.indices].astype(np.float32)
-        if not np.isfinite(flat).all():
-            entry = int(self.indices[~np.isfinite(flat)][0])
-            raise self._fault(f"entry {entry} of the observation is {value.reshape(-1)[entry]}")
-        far = (flat < self._lowest) | (flat > self._highest)
-        if far.any():
-            entry = int(self.indices[far][0])
-            bounds = flat_bounds(space)
-            raise self._fault(
-                f"entry {entry} of the observation is {value.reshape(-1)[entry]}, far outside its space, which says "
-                f"{bounds.low[entry]} to {bounds.high[entry]}: correct the observation or its space"
-            )
-        return flat
-
-    def _number(self, reward: Any) -> float:
-        value = as_array(reward)
-        if value.shape != () or value.dtype.kind not in "biuf":
-            shown = f"of shape {value.shape}" if value.shape else repr(reward)
-            raise self._fault(f"the reward is {shown}, but must be one number")
-        with np.errstate(over="ignore"):
-            if not np.isfinite(value.astype(np.float32)):
-                raise self._fault(f"the reward is {value}")
-        return float(value)
-
-    def _flag(self, value: Any, name: str) -> bool:
-        if not isinstance(value, bool | np.bool_ | int | np.integer) or value not in (0, 1):
-            raise self._fault(f"{name} is {short(value)}, but must be True or False")
-        return bool(value)
-
-
-class FaultyEnvironment(Environment):
-    """The same with the faults of its task. Their random numbers come from the seed that `reset` gets."""
-
-    def __init__(self, task: GymnasiumTask, seed: str = ""):
-        """Make the environment, and check that the noise fits its observation."""
-        super().__init__(task, seed)
-        self._faults, self._random = task.faults, np.random.default_rng()
-        size = task.faults.observed_size(self.indices.size)
-        self.observation_space = spaces.Box(-np.inf, np.inf, (size,), np.float32)
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode."""
-        obs, info = super().reset(seed=seed, options=options)
-        if seed is not None:
-            self._random = np.random.default_rng((seed, STREAM))
-        self._waiting = self._faults.start(np, obs)
-        self._action = np.zeros(self.inner_action_space.low.size, np.float32)
-        return self._observed(obs, self._draws()), info
-
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Apply an action in [-1, 1], or the previous one again."""
-        draws = self._draws()
-        self._action = self._faults.applied(np, action, self._action, draws)
-        obs, reward, terminated, truncated, info = super().step(self._action)
-        return self._observed(obs, draws), reward, terminated, truncated, info
-
-    def _observed(self, obs: np.ndarray, draws: Draws) -> np.ndarray:
-        self._waiting, seen = self._faults.observe(np, self._waiting, obs, draws)
-        return seen
-
-    def _draws(self) -> Draws:
-        size, normal, uniform = self.indices.size, self._random.standard_normal, self._random.random
-        return Draws(normal(size, np.float32), uniform(size, np.float32), uniform(), uniform())
+            raise UserError(f"{self.name} cannot be made: {said(error)}.") from None

@@ -3,6 +3,7 @@
 A run records the interface, and is not opened with another one.
 """
 
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from beliefrl.errors import UserError, short
 from beliefrl.tasks.spaces import check_names, observation_names
 
 UNNAMED = "entry "
+TAKEN = {"step", "kind", "return", "length", "mean", "sem", "seeds"}  # entries of the log and of results
 
 
 class Interface(NamedTuple):
@@ -24,9 +26,9 @@ class Interface(NamedTuple):
     def recorded(cls, value: Any) -> "Interface | None":
         """The interface that a run has recorded; None in a run from before there was one."""
         lists: list[Any] = [value.get(name) for name in cls._fields] if isinstance(value, dict) else []
-        if len(lists) < len(cls._fields) or not all(isinstance(each, list) for each in lists):
+        if len(lists) < len(cls._fields) or not all(isinstance(each, list | tuple) for each in lists):
             return None
-        return cls(tuple(map(str, lists[0])), lists[1], lists[2])
+        return cls(tuple(map(str, lists[0])), list(lists[1]), list(lists[2]))
 
     def check(self, before: Any, folder: str) -> None:
         """Raise a UserError if it differs from the one that a run has recorded. An entry without a name fits any."""
@@ -59,6 +61,13 @@ def interface_of(environment: Any, task: str) -> Interface:
     actions = environment.inner_action_space
     seen = tuple(names[index] for index in environment.indices)
     return Interface(seen, actions.low.ravel().tolist(), actions.high.ravel().tolist())
+
+
+def check_measures(names: Iterable[str], task: str) -> None:
+    """Raise a UserError if a measure of a task would replace a number of the log or of the results."""
+    for name in names:
+        if name in TAKEN or name.startswith("seeds_"):
+            raise UserError(f"{task} has a measure {name!r}, which every run has: choose another name.")
 
 
 def measure_of(info: Any, name: str) -> float | None:

@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import gymnasium
+import jax
 from gymnasium import error
 
 from beliefrl.catalogue import BULLET, KNOWN, PREFIX
@@ -63,9 +64,11 @@ def make(id: str, arguments: dict[str, Any], name: str | None = None) -> Gymnasi
 
 
 def _import(package: str, id: str) -> None:
+    wide = jax.config.read("jax_enable_x64")
     try:
         with _quiet():
             importlib.import_module(package)
+        jax.config.update("jax_enable_x64", wide)  # it would change the training
     except ModuleNotFoundError as found:
         raise UserError(_missing(id, found)) from None
     except (Exception, SystemExit) as found:  # a module may raise anything

@@ -44,7 +44,9 @@ def check_actions(space: Any, name: str) -> None:
         raise UserError(
             f"{name} has actions of shape {space.shape}: give the Box at least one dimension and at least one number."
         )
-    if not space.is_bounded():
+    with np.errstate(over="ignore"):
+        is_finite = np.isfinite(space.high.astype(np.float64) - space.low).all()
+    if not (space.is_bounded() and is_finite):
         raise UserError(f"{name} has unbounded actions: give its Box finite bounds, to which [-1, 1] is scaled.")
     for entry in np.flatnonzero(space.low >= space.high):
         bound = space.low.reshape(-1)[entry]
@@ -104,13 +106,20 @@ def flat_bounds(space: Any) -> spaces.Box:
 
 
 def fits(space: Any, obs: Any) -> bool:
-    """Whether the discrete parts of an observation are in its space. `flatten` does not check it."""
+    """Whether the parts of an observation have the sizes of their spaces, and integers are in them.
+
+    `flatten` checks neither, and casts numbers to the type of the space.
+    """
     if isinstance(space, spaces.Dict):
         return all(fits(part, obs[name]) for name, part in space.items())
     if isinstance(space, spaces.Tuple):
         return all(fits(part, value) for part, value in zip(space, obs, strict=True))
     if isinstance(space, spaces.Box):
-        return True
+        part = as_array(obs)
+        if part.dtype.kind not in "biuf" or part.size != np.prod(space.shape, dtype=int):
+            return False
+        with np.errstate(invalid="ignore"):
+            return np.issubdtype(space.dtype, np.floating) or np.array_equal(part.astype(space.dtype), part)
     value, start = as_array(obs), getattr(space, "start", 0)
     sizes = getattr(space, "nvec", getattr(space, "n", None)) if not isinstance(space, spaces.MultiBinary) else 2
     if value.dtype.kind not in "biuf" or sizes is None:

@@ -45,6 +45,7 @@ def same(run: Run, config: dict[str, Any], older: dict[str, Any]) -> None:
     `older` are the values of hyperparameters that the run does not record (`hyperparameters.values_before`).
     """
     asked = {name: config.get(name) for name in ("agent", "task", "constants", "observe", "faults")}
+    asked["constants"] = _with_functions_of(run.config["constants"], asked["constants"])
     asked |= config["options"] | _with_functions_of(run.config["hyperparameters"], config["hyperparameters"])
     before = {"faults": None} | dataclasses.asdict(Options())  # what an older version did not record, it did not have
     asked, before = plain([asked, before | older])  # tuples are lists in the run's config
@@ -82,11 +83,12 @@ def decisive(task: Any) -> tuple[str, ...]:
 
 
 def _with_functions_of(there: Any, asked: Any) -> Any:
-    """The hyperparameters `asked`, with functions as they are recorded `there`: as text with an address."""
+    """The settings `asked`, with functions and objects as they are recorded `there`: as text with an address."""
     if isinstance(asked, dict):
         known = there if isinstance(there, dict) else {}
         return {name: _with_functions_of(known.get(name), value) for name, value in asked.items()}
-    return there if callable(asked) and not isinstance(asked, type) else asked
+    has_address = (callable(asked) and not isinstance(asked, type)) or " at 0x" in str(plain(asked))
+    return there if has_address else asked
 
 
 def higher(run: Run, options: Options) -> None:

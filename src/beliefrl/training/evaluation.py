@@ -284,8 +284,10 @@ def _on_host(
     run: Run,
     ended: Callable[[int], None],
 ) -> Episode:
-    shared = Lockstep(task, [f"seed {seed}" for seed in run.seeds]) if run.options.share_env else None
-    evaluation = Evaluation(agent, task, run.seeds, "never", shared=shared)
+    always = run.options.processes == "always"  # an environment may need a process of its own
+    how = ("always", None, run.options.step_timeout) if always else ("never", None, None)
+    shared = Lockstep(task, [f"seed {seed}" for seed in run.seeds], *how) if run.options.share_env else None
+    evaluation = Evaluation(agent, task, run.seeds, *how, shared=shared)
     try:
         return evaluation.play(states, keys, episodes, ended)
     finally:

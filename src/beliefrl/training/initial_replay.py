@@ -20,6 +20,7 @@ from beliefrl.runs.options import Options
 from beliefrl.runs.run import Run
 from beliefrl.training import rollout
 from beliefrl.training.checks import about_task, decisive
+from beliefrl.training.evaluation import check_interface
 from beliefrl.training.replay import Replay
 from beliefrl.types import Spec, UserError, plain
 
@@ -40,11 +41,12 @@ def taken(options: Options, agent: Agent, task: Any, seeds: list[int]) -> tuple[
     the seed in the other run, for each seed of this training.
 
     Raises:
-        UserError: that run was trained on another task, with other `envs` or other notes, it has no undamaged
-            checkpoint, or its timesteps are not finite.
+        UserError: that run was trained on another task, with other bounds of the actions, other `envs` or other notes,
+            it has no undamaged checkpoint, or its timesteps are not finite.
     """
     source = Run(options.init_from or "")
     _same(source, agent, task, options.envs)
+    check_interface(source, task)
     step, files = stored_timesteps(source.folder)
     rings = (len(source.seeds),) if options.envs == 1 else (len(source.seeds), options.envs)
     shapes, room = _timestep(agent, task.spec), max(files[-1].stop)  # for all, so `segments.read` keeps their order

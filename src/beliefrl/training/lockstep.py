@@ -12,16 +12,19 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
+import gymnasium
 import jax
 import numpy as np
-from gymnasium import logger
+from gymnasium import logger, spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from beliefrl.errors import Fault
-from beliefrl.tasks.gymnasium import Environment, GymnasiumTask
+from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.tasks.seen_environment import Environment
 from beliefrl.training.stop import SIGNALS
 from beliefrl.types import UserError
 
@@ -79,19 +82,28 @@ class Lockstep:
         self._closed = threading.Event()
         if notify is not None:
             threading.Thread(target=self._watch, args=(notify,), daemon=True).start()
-        factories = [_Factory(task, lane) for lane in lanes]
+        made: list[Environment] = []
         try:
             with self._calling("gymnasium.make"):
                 self.apart = processes == "always" or (processes == "auto" and _pays(task, len(lanes)))
                 if self.apart:
-                    # Forking a process in which JAX runs threads may never return.
-                    self._envs = AsyncVectorEnv(factories, context="spawn", autoreset_mode=AutoresetMode.DISABLED)
-                    atexit.register(self.close)  # at its exit Python would wait for processes that ignore SIGTERM
+                    self._envs = self._processes([_Factory(task, lane) for lane in lanes])
                 else:
+                    factories = [partial(_kept, made, _Factory(task, lane)) for lane in lanes]
                     self._envs = SyncVectorEnv(factories, autoreset_mode=AutoresetMode.DISABLED)
         except BaseException:
             self._closed.set()  # nothing is under way that could be slow
+            for environment in made:
+                environment.close()
             raise
+
+    def _processes(self, factories: list["_Factory"]) -> AsyncVectorEnv:
+        # Forking a process in which JAX runs threads may never return. A daemon could not start processes of its own.
+        settings: dict[str, Any] = {"context": "spawn", "daemon": False, "autoreset_mode": AutoresetMode.DISABLED}
+        envs = AsyncVectorEnv(factories, **settings)
+        jax.config.update("jax_enable_x64", self._is_wide)  # an environment was made here too, to see its spaces
+        atexit.register(self.close)  # at its exit Python would wait for processes that ignore SIGTERM
+        return envs
 
     def reset(self, seeds: Int[np.ndarray, " lane"]) -> Any:
         """Begin an episode in every environment; returns the observations, (lane, obs)."""
@@ -191,13 +203,35 @@ class _Factory:
     """Makes one lane's environment, in this process or a worker."""
 
     def __init__(self, task: GymnasiumTask, lane: str):
-        self.task, self.lane = task, lane
+        self.task, self.lane, self.process = task, lane, os.getpid()
+        self.sizes = task.spec.obs_dim, task.spec.action_dim
 
-    def __call__(self) -> Environment:
-        if multiprocessing.parent_process() is not None:
-            for number in SIGNALS:  # sent to all processes of a job: the training saves, then ends these
-                signal.signal(number, _go_on)  # not SIG_IGN, which a program that the environment starts would inherit
-        return self.task.environment(self.lane)
+    def __call__(self) -> Any:
+        if os.getpid() == self.process:
+            return self.task.environment(self.lane)
+        for number in SIGNALS:  # sent to all processes of a job: the training saves, then ends these
+            signal.signal(number, _go_on)  # not SIG_IGN, which a program that the environment starts would inherit
+        try:
+            return self.task.environment(self.lane)
+        except UserError as error:
+            return _NotMade(f"{self.lane}: {error}", *self.sizes)
+
+
+class _NotMade(gymnasium.Env[Any, Any]):
+    """In place of an environment that cannot be made in its process: `reset` says why."""
+
+    def __init__(self, why: str, obs: int, action: int):
+        self.why = why
+        self.observation_space = spaces.Box(-np.inf, np.inf, (obs,), np.float32)
+        self.action_space = spaces.Box(-1.0, 1.0, (action,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        raise Fault(self.why)
+
+
+def _kept(made: list[Environment], factory: _Factory) -> Environment:
+    made.append(factory())
+    return made[-1]
 
 
 @contextlib.contextmanager
@@ -221,17 +255,16 @@ def step_seconds(task: GymnasiumTask) -> float:
     """The median time of 20 steps with random actions; 0 if it cannot be measured."""
     wide = jax.config.read("jax_enable_x64")
     try:
-        environment = task.environment()
-        environment.reset(seed=0)
-        actions = np.random.default_rng(0).uniform(-1, 1, (20, task.spec.action_dim))
-        times = []
-        for action in actions:
-            before = time.perf_counter()
-            _, _, terminated, truncated, _ = environment.step(action)
-            times.append(time.perf_counter() - before)
-            if terminated or truncated:
-                environment.reset()
-        environment.close()
+        with contextlib.closing(task.environment()) as environment:
+            environment.reset(seed=0)
+            actions = np.random.default_rng(0).uniform(-1, 1, (20, task.spec.action_dim))
+            times = []
+            for action in actions:
+                before = time.perf_counter()
+                _, _, terminated, truncated, _ = environment.step(action)
+                times.append(time.perf_counter() - before)
+                if terminated or truncated:
+                    environment.reset()
     except UserError:
         return 0.0
     finally:

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from beliefrl.agents import Agent
 from beliefrl.tasks import Task
+from beliefrl.tasks.interface import check_measures
 from beliefrl.training import replay as ring
 from beliefrl.training.replay import Replay
 from beliefrl.types import Spec, StoredTimestep, Timestep, UserError
@@ -32,9 +33,6 @@ class ActorState(NamedTuple):
     memory: Any  # before that timestep is perceived
     length: Int[Array, ""]  # steps of this episode so far
     episode_return: Float[Array, ""]  # undiscounted, so far
-
-
-TAKEN = {"step", "kind", "return", "length"}  # entries of an episode in the log
 
 
 class Episode(NamedTuple):
@@ -62,8 +60,7 @@ def measured(task: Task, task_state: Any) -> dict[str, Float[Array, ""]]:
     found: Any = task.measures(task_state) if names else {}  # pyright: ignore[reportAttributeAccessIssue]
     if set(found) != set(names):
         raise UserError(f"{kind}.measures returns {sorted(found)}: its spec names {sorted(names)}, so return these.")
-    if taken := TAKEN & set(names):
-        raise UserError(f"{kind} has a measure {min(taken)!r}, which every episode has: choose another name.")
+    check_measures(names, kind)
     return {name: jnp.asarray(found[name], float) for name in names}
 
 

@@ -25,8 +25,9 @@ from beliefrl.analysis.tables import measure_text
 from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.environment import TaskEnvironment
-from beliefrl.tasks.gymnasium import Environment, GymnasiumTask
+from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.interface import measure_of
+from beliefrl.tasks.seen_environment import Environment
 from beliefrl.training.evaluation import restore_seed
 from beliefrl.types import LARGEST, Timestep, UserError, check_whole, said
 

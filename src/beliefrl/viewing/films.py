@@ -75,7 +75,9 @@ def video(
     for name, rate in {"fps": fps, "fastest": fastest}.items():
         if rate is not None and (isinstance(rate, str) or not 0 < rate <= 1000):
             raise UserError(f"{name}={rate!r} is impossible: it must be a number above 0 and up to 1000.")
-    show = _window if path is None else functools.partial(_encoder, pathlib.Path(path), kind_of(pathlib.Path(path)))
+    show = _window
+    if path is not None:  # absolute: an environment may change the working directory
+        show = functools.partial(_encoder, pathlib.Path(path).absolute(), kind_of(pathlib.Path(path)))
     with Player(*restore_seed(run, seed, task, agent, best), rendered=True) as player:
         pace = pace_of(player.environment)
         every = 1 if fps else math.ceil(pace / fastest)
