@@ -55,7 +55,8 @@ def interval(
 def scores(groups: Sequence[Group], mode: str = "sampled") -> dict[str, Scores]:
     """The normalised final returns of each label, for the tasks that all labels have. A diverged seed scores 0.
 
-    For a task without an entry in BOUNDS, a return of 0 scores 0, and the best mean return of these groups scores 1.
+    For a task without an entry in BOUNDS, a return of 0 scores 0, and the best mean return of these groups scores 1. If
+    no mean is above 0, the lowest return of a seed scores 0.
 
     Raises:
         UserError: there is no task that all labels have, or no group has an evaluation of all its seeds.
@@ -77,7 +78,8 @@ def bounds(task: str, final: dict[tuple[str, str], np.ndarray]) -> tuple[float, 
     """The returns that have the scores 0 and 1."""
     of_task = [values for (of, _), values in final.items() if of == task]
     best = max((float(np.nanmean(values)) for values in of_task if np.isfinite(values).any()), default=1.0)
-    return known_bounds(task) or (0.0, best if best > 0 else 1.0)
+    lowest = min((float(np.nanmin(values)) for values in of_task if np.isfinite(values).any()), default=0.0)
+    return known_bounds(task) or ((0.0, best) if best > 0 else (min(lowest, best - 1e-6), best))
 
 
 def known_bounds(task: str) -> tuple[float, float] | None:

@@ -47,9 +47,9 @@ def paths(path: pathlib.Path) -> tuple[pathlib.Path, pathlib.Path]:
 
 def check_folder(path: pathlib.Path) -> None:
     """Raise a UserError if the folder of `path` does not exist, or if `path` itself is a folder."""
-    if not path.parent.is_dir():
+    if not os.path.isdir(path.parent):  # noqa: PTH112 - pathlib's version raises if a name is too long
         raise UserError(f"{path} cannot be written (there is no folder {path.parent}): create it, or choose another.")
-    if path.is_dir():
+    if os.path.isdir(path):  # noqa: PTH112
         raise UserError(f"{path} cannot be written (it is a folder): choose another name.")
 
 
@@ -133,6 +133,8 @@ def curve_figure(run: Run) -> Any:
         axis.spines[["top", "right"]].set_visible(False)
     count = len(run.seeds)
     spread = f"mean and S.E.M. of {count} seeds" if count > 1 else "1 seed"
+    lost = int(group.diverged.sum())
+    spread += f", {lost} diverged" if lost else ""
     axes[0].set_title(f"{run.config['agent']} on {group.task}, {spread}", loc="left", fontsize=10)
     axes[0].legend(frameon=False, loc="best", fontsize=9)
     return made

@@ -2,7 +2,7 @@
 
 import os
 import pathlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from beliefrl.analysis import results
 from beliefrl.runs.options import Options
-from beliefrl.runs.records import steps_per_action
+from beliefrl.runs.records import finite_mean, steps_per_action
 from beliefrl.runs.run import Row, Run
 from beliefrl.types import UserError
 
@@ -59,9 +59,21 @@ class Group:
         """Which seeds have diverged, (seed,)."""
         return np.array([_diverged(run, seed) for run, seed in self.seeds])
 
+    @cached_property
+    def stopped(self) -> np.ndarray:
+        """Which seeds have ended at their `stop_at`, (seed,)."""
+        return np.array([run.reached(run.options.stop_at, run.options.stop_patience) for run, _ in self.seeds])
+
     def curve(self, name: str = "sampled") -> Curve:
-        """An entry of the evaluations (sampled, mode, sampled_success, ...), at steps that all seeds have."""
-        table = [{row["step"]: float(np.mean(row[name])) for row in rows if name in row} for rows in self.evaluations]
+        """An entry of the evaluations (sampled, mode, sampled_success, ...), at steps that all seeds have.
+
+        A seed that has ended at its `stop_at` keeps its last value at the later steps of the others.
+        """
+        table = [{row["step"]: finite_mean(row[name]) for row in rows if name in row} for rows in self.evaluations]
+        every = {step for means in table for step in means}
+        for means in (table[seed] for seed in np.flatnonzero(self.stopped & ~self.diverged) if table[seed]):
+            last = max(means)
+            means |= {step: means[last] for step in every if step > last}
         healthy = [means for means, diverged in zip(table, self.diverged, strict=True) if not diverged]
         steps = sorted(set.intersection(*map(set, healthy or table)))
         return Curve(np.array(steps), np.array([[seed.get(step, np.nan) for step in steps] for seed in table]))
@@ -106,7 +118,7 @@ def find(
             continue
         if not os.path.isdir(path):  # noqa: PTH112 - pathlib's version raises if a name is too long
             raise UserError(f"There is no folder {path}: give the folder of a run or of a sweep.")
-        inside = sorted(config.parent for config in path.rglob("config.json") if (config.parent / "metrics").is_dir())
+        inside = sorted(filter(_is_run, _folders(path)))
         if not (inside or (path / "config.json").exists()):
             raise UserError(f"There is no run in {path}: give the folder of a run or of a sweep.")
         for folder in inside or [path]:
@@ -122,6 +134,22 @@ def find(
     if unreadable and not found:
         raise UserError(next(iter(unreadable.values())))
     return FoundRuns(list(found.values()), [*unreadable.values(), *logs])
+
+
+def _folders(path: pathlib.Path) -> Iterator[pathlib.Path]:
+    """The folder and all folders inside, also through links, each once."""
+    seen = set()
+    for folder, inside, _ in os.walk(path, followlinks=True):
+        real = os.path.realpath(folder)
+        if real in seen:
+            inside.clear()  # a link to a folder above
+        else:
+            seen.add(real)
+            yield pathlib.Path(folder)
+
+
+def _is_run(folder: pathlib.Path) -> bool:
+    return (folder / "config.json").exists() and (folder / "metrics").is_dir()
 
 
 def is_finished(run: Run) -> bool:
@@ -183,13 +211,20 @@ def _options(run: Run) -> list[str]:
 
 
 def left_out(runs: Sequence[Run], shown: Sequence[Group]) -> list[str]:
-    """A sentence for each run with seeds that no group counts, because another run has them."""
+    """A sentence for each run with seeds that no group counts, because another run has them, and for each group without
+    a curve, because its seeds have no evaluation at the same step.
+    """
     counted = {(run.folder, seed) for group in shown for run, seed in group.seeds}
     missing = {run.folder: [seed for seed in run.seeds if (run.folder, seed) not in counted] for run in runs}
-    return [
+    twice = [
         f"left out: {folder}, seed {' '.join(map(str, seeds))}: another run has the same settings and seed"
         for folder, seeds in missing.items()
         if seeds
+    ]
+    return twice + [
+        f"left out: {group.label} on {group.task}: its seeds have no evaluation at the same step"
+        for group in shown
+        if not (group.diverged.all() or group.curve().steps.size)
     ]
 
 

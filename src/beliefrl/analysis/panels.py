@@ -169,13 +169,20 @@ def add_legend(made: Any, colour: dict[str, str], title: str, style: dict[str, A
 def spread(groups: Sequence[Group]) -> str:
     """The legend's title: the number of seeds in the means."""
     seeds = {len(group.seeds) for group in groups}
-    return "1 seed each" if seeds == {1} else f"mean and S.E.M. of {counts(seeds)} seeds"
+    lost = sum(int(group.diverged.sum()) for group in groups)
+    after = f"; {lost} diverged, and {'is' if lost == 1 else 'are'} not in the later means" if lost else ""
+    return ("1 seed each" if seeds == {1} else f"mean and S.E.M. of {counts(seeds)} seeds") + after
 
 
 def counts(numbers: Collection[int]) -> str:
     """The range of the numbers as text: "3", or "2 to 5"."""
     low, high = min(numbers), max(numbers)
     return str(low) if low == high else f"{low} to {high}"
+
+
+def numbers(seeds: Collection[int]) -> str:
+    """Seeds as text: "0 to 4", or "0 7" if some between them are missing."""
+    return counts(seeds) if len(set(seeds)) > max(seeds) - min(seeds) else " ".join(map(str, sorted(seeds)))
 
 
 def pooled(groups: Sequence[Group], drawn: Callable[[int], dict[str, Any]], papers: dict[str, Any]) -> list[Group]:

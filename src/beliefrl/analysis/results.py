@@ -42,9 +42,11 @@ class KeptRun(Run):
 
 
 def cut(run: Run, until: int) -> KeptRun:
-    """The run with only the rows up to `until` environment steps."""
+    """The run with only the rows up to `until` environment steps. When it reached them is not known."""
     rows = {seed: [row for row in run.rows(seed) if row["step"] <= until] for seed in run.seeds}
-    return KeptRun(run.folder, run.config, rows)
+    is_cut = any(row["step"] > until for seed in run.seeds for row in run.rows(seed))
+    timeless = {name: value for name, value in run.config.items() if name not in ("started", "ended", "resumed")}
+    return KeptRun(run.folder, timeless if is_cut else run.config, rows)
 
 
 def read(path: pathlib.Path) -> list[KeptRun]:

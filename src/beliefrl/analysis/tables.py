@@ -15,7 +15,7 @@ import numpy as np
 from beliefrl.analysis.aggregate import known_bounds
 from beliefrl.analysis.figures import check_folder, standard_error
 from beliefrl.analysis.groups import Curve, Group, last_step
-from beliefrl.analysis.panels import counts
+from beliefrl.analysis.panels import numbers
 from beliefrl.runs import arrays
 from beliefrl.runs.arrays import write_whole
 from beliefrl.runs.run import Run
@@ -34,9 +34,9 @@ Cells = Sequence[str]
 
 
 def measure_text(name: str, value: float | None) -> str:
-    """A measure of episodes as text; success is a rate. A diverged seed has None."""
+    """A measure of episodes as text; success is a rate. None: there is no number, for example of a diverged seed."""
     if value is None:
-        return "diverged"
+        return "-"
     return f"{value:.0%}" if name == "success" else f"{value:.4g}"
 
 
@@ -66,6 +66,11 @@ def write_table(columns: Sequence[Column], rows: Sequence[Cells], out: pathlib.P
     Raises:
         UserError: the files cannot be written.
     """
+    if out.suffix.lower() not in ("", ".md", ".tex"):
+        kinds = "a table is written as .md and .tex"
+        raise UserError(f"{out} is impossible: {kinds}, so its name must end in one of them.")
+    if not rows:
+        raise UserError("The table would be empty: none of these runs has an evaluation there.")
     check_folder(out)
     try:
         write_whole(out.with_suffix(".tex"), latex(columns, rows).encode())
@@ -92,11 +97,11 @@ def final_rows(groups: Sequence[Group]) -> list[tuple[str, ...]]:
 
     A task is solved at the first evaluation whose mean over seeds has a score of 0.95, with sampled or mode actions.
     """
-    table = []
+    table: list[tuple[str, ...]] = []
     for group in groups:
         sampled, mode = group.curve("sampled"), group.curve("mode")
-        if not sampled.steps.size:
-            continue
+        if not (sampled.steps.size or group.diverged.all()):
+            continue  # `left_out` names it
         spans = [wall_clock(run) for run in group.runs]
         known = [span for span in spans if span is not None]
         seconds = sum(known) / sum(len(run.seeds) for run in group.runs) if len(known) == len(spans) else None
@@ -104,8 +109,8 @@ def final_rows(groups: Sequence[Group]) -> list[tuple[str, ...]]:
             (
                 group.task,
                 group.label,
-                counts([seed for _, seed in group.seeds]),
-                f"{sampled.steps[-1]:,}",
+                numbers([seed for _, seed in group.seeds]),
+                f"{sampled.steps[-1]:,}" if sampled.steps.size else "-",
                 _final(group, "sampled") + _measures(group, "sampled"),
                 _final(group, "mode") + _measures(group, "mode"),
                 "no" if group.diverged.all() else _solved(group.task, sampled, mode),

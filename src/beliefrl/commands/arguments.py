@@ -7,7 +7,7 @@ import io
 import json
 import pathlib
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from decimal import Decimal, InvalidOperation
 from types import NoneType, UnionType
 from typing import Annotated, Any, Union, get_args
@@ -165,6 +165,7 @@ def parse(options: Any, argv: Sequence[str], prog: str, advice: str = "") -> Any
     """
     if any(arg in ("-h", "--help") for arg in argv):
         return tyro.cli(options, prog=prog, args=argv, registry=VALUES)
+    _refuse_repeated(_lists(options), argv)
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box), contextlib.redirect_stdout(box):
@@ -174,6 +175,14 @@ def parse(options: Any, argv: Sequence[str], prog: str, advice: str = "") -> Any
     if unknown:
         raise UserError(_unknown(options, unknown[0], prog, advice))
     return parsed
+
+
+def _refuse_repeated(lists: Collection[str], argv: Sequence[str]) -> None:
+    """Raise a UserError if an option with several values is given twice: the second would replace the first."""
+    given = [option for option in (arg.split("=")[0] for arg in argv) if option in lists]
+    for option in given:
+        if given.count(option) > 1:
+            raise UserError(f"{option} is given twice: give all its values at once, {option} A B.")
 
 
 def refuse_empty(argv: Sequence[str], *options: str) -> None:
@@ -212,6 +221,8 @@ def value_lists(given: Sequence[str], option: str) -> dict[str, list[Any]]:
         name = name.replace("-", "_")
         named_values([name + separator + text], option)  # raises an error unless it is NAME=VALUE
         parts = re.split(r",(?![^\[]*\])", text)
+        if name in lists:
+            raise UserError(f"{option} has {name} twice: give all its values at once, {name}=A,B.")
         lists[name] = [named_values([f"value={part}"], option)["value"] for part in parts]
     return lists
 
@@ -249,8 +260,18 @@ def _unknown(options: Any, given: str, prog: str, advice: str) -> str:
 
 def _option_names(options: Any) -> list[str]:
     """The names of all fields of a dataclass and of the dataclasses in it."""
-    names = []
+    return [name for name, _ in _fields(options)]
+
+
+def _lists(options: Any) -> set[str]:
+    """The options that have several values."""
+    return {f"--{name.replace('_', '-')}" for name, kind in _fields(options) if "tuple[" in str(kind)}
+
+
+def _fields(options: Any) -> list[tuple[str, Any]]:
+    """The name and type of all fields of a dataclass and of the dataclasses in it."""
+    found = []
     for field in dataclasses.fields(options):
         kind = getattr(field.type, "__origin__", field.type)
-        names += _option_names(kind) if dataclasses.is_dataclass(kind) else [field.name]
-    return names
+        found += _fields(kind) if dataclasses.is_dataclass(kind) else [(field.name, field.type)]
+    return found

@@ -90,6 +90,8 @@ def _ranges(given: Sequence[str]) -> dict[str, Any]:
     found = {}
     for each in given:
         ((name, values),) = value_lists([each], "--range").items()
+        if name in found:
+            raise UserError(f"--range has {name} twice: give it once.")
         found[name] = from_text(name, each.partition("=")[2]) or values
     return found
 

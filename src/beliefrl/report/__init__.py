@@ -46,12 +46,15 @@ def write_report(
     out = pathlib.Path(out)
     if out.suffix not in (".html", ".htm"):
         raise UserError(f"{out} must end in .html, such as report.html.")
+    if not isinstance(paths, str | os.PathLike) and not paths:
+        raise UserError("There are no runs: give folders of runs, folders that contain runs, or files of results.")
     if not os.path.isdir(out.parent):  # noqa: PTH112 - pathlib's version raises if a name is too long
         raise UserError(
             f"There is no folder {out.parent} to write {out.name} into: create it, or choose another --out."
         )
     found = find(paths, CachedRun)
-    content = page(page_data(found.runs, out.parent, unfinished) | {"damage": found.damage})
+    data = page_data(found.runs, out.parent, unfinished)
+    content = page(data | {"damage": [*data.pop("without_curve"), *found.damage]})
     try:
         write_whole(out, content.encode())
     except OSError as error:

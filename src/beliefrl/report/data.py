@@ -59,12 +59,19 @@ def page_data(runs: Sequence[Run], page_folder: pathlib.Path, unfinished: bool =
         "tasks": list(dict.fromkeys(group.task for group in lines)),
         "labels": [{"name": label, "colour": colour, "dash": dash[label]} for label, colour in palette.items()],
         "groups": [_group(group) for group in lines],
+        "without_curve": [_without_curve(group) for group in grouped if group not in lines],
         "runs": [
             _run(run, page_folder, [group_of.get((run.folder, seed)) for seed in run.seeds])
             | {"elsewhere": elsewhere.get(run.folder, [])}
             for run in runs
         ],
     }
+
+
+def _without_curve(group: Group) -> str:
+    lost = group.diverged.all()
+    why = "all seeds have diverged" if lost else "its seeds have no evaluation at the same step"
+    return f"{group.label} on {group.task} has no curve: {why}"
 
 
 def _has_begun(run: Run) -> bool:

@@ -182,21 +182,22 @@ class Checkpoints:
         Raises:
             UserError: there is no undamaged checkpoint, or it is from another training or version.
         """
-        passed_over = []
+        passed_over: dict[pathlib.Path, str] = {}
         for path in self._listed():
             try:
                 content = checked(path)
             except Damaged as error:
-                passed_over.append(str(error))
-                path.rename(path.with_name(f"damaged-{path.name}"))
+                passed_over[path] = str(error)
                 continue
             tree = arrays.read(path / "state.safetensors", like, renamed)
             self._segments = [Segment(**segment) for segment in content["replay"]]
             rings, missing = segments.read(self.folder / "replay", timesteps, self._segments, axes)
             if missing.any():  # the rings are numbered anew, so the files do not continue them
                 self._segments = []
-            return Found(content["step"], content["progress"], tree, rings, missing, passed_over)
-        why = f": {passed_over[0]}" if passed_over else "."
+            for damaged in passed_over:  # only now: if there is none to go on from, a missing file may come back
+                damaged.rename(damaged.with_name(f"damaged-{damaged.name}"))
+            return Found(content["step"], content["progress"], tree, rings, missing, list(passed_over.values()))
+        why = f": {next(iter(passed_over.values()))}" if passed_over else "."
         raise UserError(f"{self.folder.parent} has no checkpoint to continue from{why}")
 
 

@@ -17,11 +17,23 @@ from importlib import metadata
 from typing import Any
 
 import jax
+import numpy as np
 
 from beliefrl.types import LARGEST, UserError, cause
 
 PACKAGES = ("beliefrl", "jax", "jaxlib", "equinox", "optax", "numpy")
 Row = dict[str, Any]
+
+
+def finite_mean(values: Any) -> float:
+    """The mean of the finite values; NaN without any. A measure may be NaN in an episode."""
+    numbers = np.asarray(values, float)
+    return float(numbers[np.isfinite(numbers)].mean()) if np.isfinite(numbers).any() else float("nan")
+
+
+def finite_or_none(value: float) -> float | None:
+    """The value; None if it is not finite, since JSON has no such numbers."""
+    return float(value) if np.isfinite(value) else None
 
 
 def parsed(path: pathlib.Path) -> Any:

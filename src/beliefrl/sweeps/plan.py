@@ -204,7 +204,7 @@ def _seed_ranges(experiment: Experiment, seeds_per_run: int | None) -> list[tupl
     gains = compiled and experiment.agent in GAIN_SIDE_BY_SIDE
     most = seeds_per_run or (len(experiment.seeds) if gains else 1)
     ranges: list[tuple[int, int]] = []
-    for seed in sorted(experiment.seeds):
+    for seed in sorted(set(experiment.seeds)):
         if ranges and sum(ranges[-1]) == seed and ranges[-1][1] < most:
             ranges[-1] = (ranges[-1][0], ranges[-1][1] + 1)
         else:
@@ -254,12 +254,17 @@ def _check(trainings: Iterable[Training]) -> None:
     known: set[str] = set()
     for training in trainings:
         agent = agent_of(training.agent, training.settings)
-        capacity(agent, Options(**_typed(training.options, Options)))
+        capacity(agent, options_of(training))
         task = [training.task, training.observe or None, training.faults, training.constants]
         key = json.dumps(plain(task), sort_keys=True)
         if key not in known:
             known.add(key)
             _ = tasks.make(*task[:3], **training.constants).spec  # making an environment may fail
+
+
+def options_of(training: Training) -> Options:
+    """The options of a training, with their types."""
+    return Options(**_typed(training.options, Options))
 
 
 def agent_of(name: str, hyperparameters: dict[str, Any]) -> Any:

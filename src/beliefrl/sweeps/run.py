@@ -1,6 +1,7 @@
 """The loop of a sweep: start waiting trainings, collect finished ones, and continue after a stop."""
 
 import contextlib
+import dataclasses
 import os
 import pathlib
 import time
@@ -9,12 +10,15 @@ from typing import Any, Protocol, runtime_checkable
 
 from beliefrl import agents
 from beliefrl.runs.folder import locked
+from beliefrl.runs.options import Options
+from beliefrl.runs.run import Run
 from beliefrl.sweeps import places, sources
 from beliefrl.sweeps import plan as plans
 from beliefrl.sweeps.plan import Experiment, Training
 from beliefrl.sweeps.progress import SweepDisplay, SweepStatus
+from beliefrl.training.checks import CHANGEABLE
 from beliefrl.training.stop import Requests, Stopped
-from beliefrl.types import UserError, cause, check_whole, one_line
+from beliefrl.types import UserError, cause, check_whole, one_line, plain
 
 LOOK_EVERY = 0.5  # seconds
 ALL = 10_000  # seeds in one run, more than any experiment has
@@ -74,7 +78,9 @@ def sweep(
         try:
             on_gpu = launcher.has_gpus if isinstance(launcher, places.Cluster) else slots[0].startswith("gpu")
             together = seeds_per_run or (ALL if on_gpu else None)
-            status = _status(folder, plans.extended(before, experiments, together))
+            trainings = plans.extended(before, experiments, together)
+            _check_options(folder, trainings)
+            status = _status(folder, trainings)
             with reporting(folder, report, progress) as listen, Requests() as requests:
                 _loop(folder, status, launcher, listen, requests)
         finally:
@@ -107,6 +113,22 @@ def _check_named(folder: pathlib.Path, before: Sequence[Training], experiments: 
         if agents.is_own(training.agent) and training.agent not in named:
             shown = one_line(training.agent)
             raise UserError(f"{folder} trains {shown}: name that agent again, with --agents {shown} and its --tasks.")
+
+
+def _check_options(folder: pathlib.Path, trainings: Sequence[Training]) -> None:
+    """Raise a UserError if a training has begun with other options, except those that may change."""
+    for training in trainings:
+        try:
+            run = Run(folder / training.name)
+        except UserError:  # not begun, or damaged, which the training will say
+            continue
+        there = dataclasses.asdict(Options()) | run.config["options"]
+        for name, value in dataclasses.asdict(plans.options_of(training)).items():
+            if name not in (*CHANGEABLE, "seed", "seeds") and plain(there[name]) != plain(value):
+                raise UserError(
+                    f"{run.folder} was trained with {name}={there[name]}, not {value}: choose another --out, in Python "
+                    "out=."
+                )
 
 
 def _status(folder: pathlib.Path, trainings: Sequence[Training]) -> SweepStatus:

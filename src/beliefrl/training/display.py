@@ -15,6 +15,7 @@ from beliefrl.analysis.figures import curve_figure
 from beliefrl.analysis.tables import measure_text
 from beliefrl.runs.best import evaluations
 from beliefrl.runs.checkpoint import listed
+from beliefrl.runs.records import finite_mean, finite_or_none
 from beliefrl.runs.run import Run
 from beliefrl.training.evaluation import as_argument
 from beliefrl.training.schedule import Event, Phase
@@ -98,7 +99,8 @@ class TrainingDisplay:
         sampled, mode = np.nanmean(result.episode_return, axis=(0, 2))  # diverged seeds are NaN
         line = f"step {event.step:,}: return {sampled:.1f} sampled, {mode:.1f} mode"
         for name, values in result.measures.items():
-            sampled, mode = (measure_text(name, float(value)) for value in np.nanmean(values, axis=(0, 2)))
+            means = (finite_or_none(finite_mean(values[:, index])) for index in range(2))
+            sampled, mode = (measure_text(name, mean) for mean in means)
             line += f"; {name} {sampled} sampled, {mode} mode"
         self.screen.line(line)
         self.screen.picture(self._curve)

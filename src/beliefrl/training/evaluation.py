@@ -13,6 +13,7 @@ from beliefrl import agents, tasks
 from beliefrl.agents import Agent, hyperparameters
 from beliefrl.imports import path
 from beliefrl.runs.options import MOST_EPISODES
+from beliefrl.runs.records import finite_mean, finite_or_none
 from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.faults import Faults
@@ -43,14 +44,14 @@ def summary(result: Episode) -> dict[str, Any]:
         table[mode] = {
             "mean": float(finite.mean()),
             "sem": float(finite.std(ddof=1) / np.sqrt(finite.size)) if finite.size > 1 else None,
-            "seeds": [float(mean) if np.isfinite(mean) else None for mean in seeds],
+            "seeds": list(map(finite_or_none, seeds)),
             "success": None,
             "seeds_success": None,
         }
         for name, values in result.measures.items():
-            of_seeds = np.asarray(values)[:, index].mean(axis=-1)
-            table[mode][name] = float(np.nanmean(of_seeds))
-            table[mode][f"seeds_{name}"] = [float(mean) if np.isfinite(mean) else None for mean in of_seeds]
+            of_seeds = [finite_mean(episodes) for episodes in np.asarray(values)[:, index]]
+            table[mode][name] = finite_or_none(finite_mean(of_seeds))
+            table[mode][f"seeds_{name}"] = list(map(finite_or_none, of_seeds))
     return table
 
 
@@ -136,7 +137,13 @@ def _check_seed(run: Run, seed: int | None) -> None:
 
 def _of_seed(run: Run, states: Any, seed: int | None) -> Any:
     index = 0 if seed is None else run.seeds.index(seed)
-    return jax.tree.map(lambda leaf: leaf[index], states)
+    chosen = jax.tree.map(lambda leaf: leaf[index], states)
+    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(chosen)):
+        raise UserError(
+            f"Seed {run.seeds[index]} of {run.folder} has diverged before its first evaluation, so it has no agent: "
+            "give another seed."
+        )
+    return chosen
 
 
 def agent_of(run: Run, agent: Agent | type | None = None) -> Agent:

@@ -1,6 +1,7 @@
 """`train` and `resume`: check the arguments and open the folder. `session` runs the training."""
 
 import contextlib
+import copy
 import dataclasses
 import os
 from collections.abc import Iterator
@@ -9,7 +10,7 @@ from typing import Any, Literal
 from beliefrl import agents, tasks
 from beliefrl.agents import Agent, hyperparameters
 from beliefrl.runs.checkpoint import listed, was_ever_written
-from beliefrl.runs.folder import free_folder
+from beliefrl.runs.folder import free_folder, write_config
 from beliefrl.runs.records import provenance
 from beliefrl.runs.run import Recorder, Run
 from beliefrl.tasks import Task
@@ -17,7 +18,8 @@ from beliefrl.tasks.given import given
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import checks, initial, initial_replay
 from beliefrl.training.evaluation import agent_of, check_interface, task_of
-from beliefrl.training.schedule import Event, Options, capacity
+from beliefrl.training.phases import SeedState
+from beliefrl.training.schedule import Event, Options, Snapshot, capacity
 from beliefrl.training.session import Callback, Session
 from beliefrl.types import UserError, tuples
 
@@ -170,13 +172,30 @@ def _go_on(
         checks.higher(recorder, options)
         _ = capacity(made_by, options)  # raise before the run's config changes
         checks.possible(options, made, own_process)
+        earlier = copy.deepcopy(recorder.config)
         recorder.amend({"options": dataclasses.asdict(options)}, provenance())
         listen = showing.enter_context(_reporting(recorder, *listeners, progress))
         training = Session(recorder, made_by, made, options, listen, own_process)
         if begins_again:
             training.begin_again()
         stack.pop_all()
-        return training.run(None if begins_again else training.restore)
+        return training.run() if begins_again else _run_restored(training, earlier)
+
+
+def _run_restored(training: Session, earlier: dict[str, Any]) -> Run:
+    """Continue from a checkpoint. If that fails before it is read, the run has its `earlier` config again."""
+    read = []
+
+    def restore(shapes: SeedState) -> Snapshot:
+        read.append(training.restore(shapes))
+        return read[0]
+
+    try:
+        return training.run(restore)
+    finally:
+        if not read:
+            with contextlib.suppress(OSError):
+                write_config(training.recorder.folder, earlier)
 
 
 class _OfCallback(Exception):
