@@ -8,7 +8,8 @@ from safetensors.numpy import save_file
 from beliefrl.analysis import aggregate, panels
 from beliefrl.analysis.figures import curve_figure, draw_curve, standard_error
 from beliefrl.analysis.groups import Curve, groups
-from beliefrl.analysis.panels import dashes
+from beliefrl.analysis.panels import dashes, spread
+from beliefrl.analysis.results import cut
 from beliefrl.analysis.tables import (
     COSTS,
     TIMED_STEPS,
@@ -406,3 +407,45 @@ def test_sensitivity_compares_the_papers_settings_with_those_drawn_for_each_seed
     assert sorted(seed for _, seed in other.seeds) == list(range(6))
     with pytest.raises(UserError, match="not a sensitivity study"):
         panels.pooled(groups(runs[-1:]), sources.drawn, sources.PAPERS)
+
+
+def test_a_row_of_a_group_that_diverged_before_its_first_evaluation(tmp_path):
+    good = a_run(tmp_path / "good", [flat(5.0)])
+    bad = a_run(tmp_path / "bad", [[]], agent="slac", diverged=[0])
+    rows = final_rows(groups([good, bad]))
+    assert [row[1] for row in rows] == ["vrm", "slac"]
+    assert rows[1][3:7] == ("-", "diverged", "diverged", "no")
+
+
+def test_seeds_that_are_missing_are_not_counted_in_a_row(tmp_path):
+    runs = [a_run(tmp_path / str(seed), [flat(5.0)], first=seed) for seed in (0, 7)]
+    assert final_rows(groups(runs))[0][2] == "0 7"
+    assert final_rows(groups([*runs, a_run(tmp_path / "1", [flat(5.0)], first=1)]))[0][2] == "0 1 7"
+
+
+def test_the_time_until_an_earlier_step_is_unknown(tmp_path):
+    times = {"started": "2026-01-01T00:00:00+00:00", "ended": "2026-01-01T01:00:00+00:00"}
+    run = a_run(tmp_path / "one", [flat(1.0, 2.0)], **times)
+    assert wall_clock(run) == wall_clock(cut(run, 20)) == 3600.0
+    assert wall_clock(cut(run, 10)) is None
+    assert final_rows(groups([cut(run, 10)]))[0][-1] == "unknown"
+
+
+@pytest.mark.parametrize("name", ["table.v1", "numbers.csv"])
+def test_another_ending_of_a_table_is_one_sentence(tmp_path, name):
+    with pytest.raises(UserError, match=r"a table is written as .md and .tex, so its name must end in one of them"):
+        write_final(groups([a_run(tmp_path / "one", [flat(1.0)])]), tmp_path / name)
+    with pytest.raises(UserError, match="The table would be empty"):
+        write_final([], tmp_path / "table.md")
+
+
+def test_a_name_that_is_too_long_is_one_sentence(tmp_path):
+    with pytest.raises(UserError, match="cannot be written"):
+        write_final(groups([a_run(tmp_path / "one", [flat(1.0)])]), tmp_path / ("x" * 300))
+
+
+def test_a_legend_says_how_many_seeds_have_diverged(tmp_path):
+    made = groups([a_run(tmp_path / "one", [flat(1.0), flat(2.0), flat(3.0)], diverged=[1])])
+    assert spread(made) == "mean and S.E.M. of 3 seeds; 1 diverged, and is not in the later means"
+    title = curve_figure(made[0].runs[0]).axes[0].get_title(loc="left")
+    assert title.endswith("mean and S.E.M. of 3 seeds, 1 diverged")

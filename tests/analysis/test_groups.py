@@ -1,6 +1,7 @@
 """Groups of runs: which seeds belong to one line of a figure, and which do not."""
 
 import json
+import math
 import shutil
 
 import numpy as np
@@ -270,3 +271,51 @@ def test_the_picture_is_made_of_one_seed_too(tmp_path):
     runs = [a_run(tmp_path / "a", [flat(-150.0)], task="pendulum")]
     assert draw_aggregate(groups(runs), tmp_path / "picture").stat().st_size > 10_000
     assert (tmp_path / "picture.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_a_diverged_seed_scores_lowest_where_all_returns_are_negative(tmp_path):
+    """The task has no known bounds, so its scores come from the returns of these runs."""
+    name = "gym:Own-v0"
+    good = a_run(tmp_path / "a", [flat(-160.0), flat(-170.0)], task=name)
+    bad = a_run(tmp_path / "b", [flat(-300.0), flat(-1.0)], task=name, agent="slac", diverged=[1])
+    (ours,), (theirs,) = scores(groups([good, bad])).values()
+    assert ours[0] > ours[1] > theirs[0] == theirs[1] == 0.0
+    assert ours.mean() == pytest.approx(1.0)
+
+
+def test_a_seed_that_stopped_at_its_return_keeps_its_last_value(tmp_path):
+    rows = [flat(-900.0, -200.0), flat(-900.0, -800.0, -700.0, -100.0)]
+    options = {"stop_at": -250.0, "stop_patience": 1}
+    runs = [a_run(tmp_path / str(n), [each], first=n, steps=100) for n, each in enumerate(rows)]
+    for run in runs:
+        config = json.loads((run.folder / "config.json").read_text())
+        config["options"] |= options
+        (run.folder / "config.json").write_text(json.dumps(config))
+    (group,) = groups(find([tmp_path]).runs)
+    np.testing.assert_array_equal(group.final(), [-200.0, -100.0])
+    np.testing.assert_array_equal(group.curve().seeds[0], [-900, -200, -200, -200])
+
+
+def test_a_measure_that_is_nan_in_an_episode_does_not_count_there(tmp_path):
+    run = a_run(tmp_path / "a", [flat(1.0)])
+    log = next((run.folder / "metrics").iterdir())
+    row = {"step": 20, "kind": "evaluation", "sampled": [1.0, 2.0], "mode": [1.0, 2.0], "sampled_time": [3.0, math.nan]}
+    log.write_text(json.dumps(row) + "\n")
+    (group,) = groups([run])
+    assert group.final("sampled_time") == 3.0
+
+
+def test_seeds_without_a_common_evaluation_are_named(tmp_path):
+    one = a_run(tmp_path / "one", [flat(1.0, 2.0)])
+    other = a_run(tmp_path / "other", [[(11, [1.0]), (21, [2.0])]], first=1)
+    assert left_out([one, other], groups([one, other])) == [
+        "left out: vrm on pendulum-v: its seeds have no evaluation at the same step"
+    ]
+
+
+def test_runs_are_found_through_links_and_a_link_in_a_circle_ends(tmp_path):
+    a_run(tmp_path / "there" / "one", [flat(1.0)])
+    (tmp_path / "links").mkdir()
+    (tmp_path / "links" / "first").symlink_to(tmp_path / "there" / "one")
+    (tmp_path / "links" / "circle").symlink_to(tmp_path / "links")
+    assert len(find([tmp_path / "links"]).runs) == 1

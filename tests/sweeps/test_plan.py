@@ -249,3 +249,8 @@ def test_a_preset_takes_other_tasks_agents_and_seeds():
     assert [(each.agent, each.task, tuple(each.seeds)) for each in made] == [("vrm", "target-reaching", (8,))]
     with pytest.raises(UserError, match="no preset 'paper'"):
         sources.preset("paper")
+
+
+def test_a_seed_that_is_given_twice_is_trained_once():
+    made = plan([Experiment("sac-mlp", "pendulum-v", seeds=(0, 1, 1, 0, 2))])
+    assert [(training.options["seed"], training.options["seeds"]) for training in made] == [(0, 3)]

@@ -261,3 +261,13 @@ def test_the_first_seed_can_be_given_alone(asked, tmp_path):
     (tmp_path / "mine.py").write_text("\n".join(lines))
     for line, seeds in (("", [[4, 2], [3]]), ("--seed 0", [[2, 0], [1]]), ("--seed 9 --seeds 2", [[9, 10], [9, 10]])):
         assert [list(each.seeds) for each in experiments(asked, f"mine.py {line}")] == seeds
+
+
+def test_other_options_of_a_training_that_has_begun_are_refused_and_not_kept(tmp_path):
+    sweep(TWO, tmp_path)
+    plan = (tmp_path / "sweep.json").read_text()
+    other = grid(["vrm"], ["pendulum", "cartpole"], seeds=2, steps=20, eval_episodes=50)
+    with pytest.raises(UserError, match="was trained with eval_episodes=5, not 50: choose another --out"):
+        sweep(other, tmp_path)
+    assert (tmp_path / "sweep.json").read_text() == plan
+    assert len(sweep(TWO, tmp_path).finished) == 4

@@ -22,6 +22,7 @@ from beliefrl.tasks import make
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.stop import Stopped
 from beliefrl.types import UserError
+from worlds import saved
 from wrong import Fine, Raising
 
 SIZES = {"policy_layers": (8,), "value_layers": (8,), "batch_size": 8, "standardise": True}
@@ -465,3 +466,29 @@ def test_mistakes_about_runs_are_sentences(whole, tmp_path, monkeypatch, capsys,
     assert ended.value.code == 2
     assert phrase in err
     assert err.count("\n") == 1
+
+
+def test_a_resume_that_finds_no_checkpoint_changes_nothing(whole, tmp_path):
+    """Its files may come back, for example those of a copy that has not ended."""
+    folder = tmp_path / "run"
+    shutil.copytree(whole[0], folder)
+    before = (folder / "config.json").read_text()
+    (folder / "checkpoints" / "replay").rename(tmp_path / "away")
+    with pytest.raises(UserError, match="has no checkpoint to continue from"):
+        resume(folder, steps=360)
+    assert (folder / "config.json").read_text() == before
+    assert is_finished(Run(folder))
+    (tmp_path / "away").rename(folder / "checkpoints" / "replay")
+    assert Run(resume(folder, steps=260).folder).options.steps == 260
+
+
+def test_a_seed_that_has_never_had_an_agent_is_not_loaded(tmp_path):
+    run = saved(tmp_path / "run", "sac-mlp", make("pendulum-v"), seeds=2)
+    path = run.agents()
+    arrays = {name: array.copy() for name, array in load_arrays(path).items()}
+    for array in (each for each in arrays.values() if each.dtype.kind == "f"):
+        array[1] = np.nan
+    path.write_bytes(packed(arrays))
+    with pytest.raises(UserError, match=r"Seed 5 of .* has diverged before its first evaluation, so it has no agent"):
+        load(run, seed=5)
+    load(run, seed=4)

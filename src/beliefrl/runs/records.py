@@ -31,7 +31,7 @@ def finite_mean(values: Any) -> float:
     return float(numbers[np.isfinite(numbers)].mean()) if np.isfinite(numbers).any() else float("nan")
 
 
-def finite_or_none(value: float) -> float | None:
+def finite_or_none(value: Any) -> float | None:
     """The value; None if it is not finite, since JSON has no such numbers."""
     return float(value) if np.isfinite(value) else None
 
