@@ -111,6 +111,8 @@ MISTAKES = {
     "tune --trial 3": "agent is missing",
     "tune vrm": "TASK is missing",
     "tune vmr pendulum": "no agent 'vmr': did you mean vrm?",
+    f"tune vrm pendulum --out {'x' * 300}": "cannot be made",
+    f"sweep {'x' * 300}.py": "There is no file",
     "tune vrm pendulm": "no task 'pendulm': did you mean pendulum?",
     "tune vrm pendulum --trials 0": "trials=0 is impossible: it must be a whole number of at least 1",
     "tune vrm pendulum --workers 0": "workers=0 is impossible",

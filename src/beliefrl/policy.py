@@ -206,7 +206,7 @@ class Policy:
         """
         path = pathlib.Path(path)
         check_folder(path)
-        if path.exists() and not overwrite:
+        if os.path.exists(path) and not overwrite:  # noqa: PTH110 - pathlib's raises where it may not look
             raise UserError(f"{path} exists already: choose another file, or replace it with overwrite (--overwrite).")
         if path.suffix.lower() == ".onnx":
             sizes = self.agent, self.spec, self._state

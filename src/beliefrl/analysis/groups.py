@@ -119,7 +119,7 @@ def find(
         if not os.path.isdir(path):  # noqa: PTH112 - pathlib's version raises if a name is too long
             raise UserError(f"There is no folder {path}: give the folder of a run or of a sweep.")
         inside = sorted(filter(_is_run, _folders(path)))
-        if not (inside or (path / "config.json").exists()):
+        if not (inside or os.path.exists(path / "config.json")):  # noqa: PTH110
             raise UserError(f"There is no run in {path}: give the folder of a run or of a sweep.")
         for folder in inside or [path]:
             known = folder.resolve()
@@ -149,7 +149,7 @@ def _folders(path: pathlib.Path) -> Iterator[pathlib.Path]:
 
 
 def _is_run(folder: pathlib.Path) -> bool:
-    return (folder / "config.json").exists() and (folder / "metrics").is_dir()
+    return os.path.exists(folder / "config.json") and os.path.isdir(folder / "metrics")  # noqa: PTH110, PTH112
 
 
 def is_finished(run: Run) -> bool:

@@ -51,7 +51,7 @@ class Run:
         if not os.path.isdir(self.folder):  # noqa: PTH112 - pathlib's version raises if a name is too long
             raise UserError(f"There is no run folder {self.folder}: give the --out of a training.")
         path = self.folder / "config.json"
-        if not path.exists():
+        if not os.path.exists(path):  # noqa: PTH110
             raise UserError(f"{self.folder} is not a run: it has no config.json; give the --out of a training.")
         self.config: dict[str, Any] = records.parsed(path)
         if self.config is None:

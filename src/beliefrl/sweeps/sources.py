@@ -114,7 +114,7 @@ def load(path: str | os.PathLike[str]) -> list[Experiment]:
         UserError: there is no such file, it raises an exception, or it does not define such a list.
     """
     path = pathlib.Path(path)
-    if not path.is_file():
+    if not os.path.isfile(path):  # noqa: PTH113 - pathlib's version raises if a name is too long
         raise UserError(f"There is no file {path}: give a Python file that defines a list `experiments`.")
     spec = importlib.util.spec_from_file_location("beliefrl_sweep", path)
     if spec is None or spec.loader is None:

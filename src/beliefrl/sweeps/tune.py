@@ -152,7 +152,8 @@ def _check(trials: int, seeds: int, seed: int, workers: int | None, objective: s
 
 def _check_folder(folder: pathlib.Path) -> None:
     """Raise a UserError if the folder has files of something else than a study."""
-    others = {path.name for path in folder.iterdir()} - {"lock", "logs"} if folder.is_dir() else set()
+    is_there = os.path.isdir(folder)  # noqa: PTH112 - pathlib's version raises if a name is too long
+    others = {path.name for path in folder.iterdir()} - {"lock", "logs"} if is_there else set()
     if others and study.JOURNAL not in others:
         raise UserError(f"{folder} exists already and has no study: choose another --out, in Python out=.")
 

@@ -139,10 +139,8 @@ def _of_seed(run: Run, states: Any, seed: int | None) -> Any:
     index = 0 if seed is None else run.seeds.index(seed)
     chosen = jax.tree.map(lambda leaf: leaf[index], states)
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(chosen)):
-        raise UserError(
-            f"Seed {run.seeds[index]} of {run.folder} has diverged before its first evaluation, so it has no agent: "
-            "give another seed."
-        )
+        which = f"Seed {run.seeds[index]} of {run.folder}"
+        raise UserError(f"{which} has diverged before its first evaluation, so it has no agent: give another seed.")
     return chosen
 
 
