@@ -93,7 +93,7 @@ def test_the_command_compares_in_an_episode_of_the_task(tmp_path, capsys):
     cli.main(["export", str(run.folder), str(file)])
     printed = capsys.readouterr().out
     assert f"written to {file}: onnxruntime reads it" in printed
-    assert "largest difference from the policy in an episode: " in printed
+    assert "largest difference from the policy: " in printed
     before = file.read_bytes()
     with pytest.raises(SystemExit) as end:
         cli.main(["export", str(run.folder), str(file)])

@@ -29,7 +29,7 @@ from beliefrl.tasks import Task
 from beliefrl.tasks.environment import TaskEnvironment
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.interface import Interface
-from beliefrl.training.evaluation import restore_policy, task_of
+from beliefrl.training.evaluation import check_interface, restore_policy, task_of
 from beliefrl.types import LARGEST, Spec, Timestep, UserError, cause, check_whole
 
 State = tuple[np.ndarray, ...]
@@ -61,6 +61,7 @@ class Policy:
         self._empty = jax.device_get(agent.reset(spec))  # the memory at the start of an episode
         self._act = jax.jit(lambda *inputs: self._step(self._state, *inputs))
         self._calls = 0
+        self._ignores_reward = False  # found when a reward is left out
 
     def __repr__(self) -> str:
         """The agent, task, sizes and seed: `<Policy vrm on pendulum-v: observation (1,), action (1,), seed 0>`."""
@@ -154,8 +155,8 @@ class Policy:
         seed = np.uint32((self.seed * 1_000_003 + self._calls) % (LARGEST + 1))
         obs, reward = obs.astype(np.float32), reward.astype(np.float32)
         action, after = jax.device_get(self._act(obs, reward, state, starts, seed, mode))
-        if is_missing:
-            other = jax.device_get(self._act(obs, reward + np.float32(1), state, starts, seed, mode))
+        if is_missing and not self._ignores_reward:
+            other = jax.device_get(self._act(obs, np.full_like(reward, np.nan), state, starts, seed, mode))
             self._check_unused(after, other[1])
         finite = np.all([np.isfinite(leaf.reshape(batch, -1)).all(axis=1) for leaf in after], axis=0)
         for episode in np.flatnonzero(~finite):
@@ -164,10 +165,11 @@ class Policy:
         return (action[0] if single else action), after
 
     def _check_unused(self, after: State, other: State) -> None:
-        """Raise a UserError if two states differ that followed on different rewards."""
-        if not all(np.array_equal(a, b, equal_nan=True) for a, b in zip(after, other, strict=True)):
+        """Raise a UserError if the state after a reward that is NaN differs from that after 0."""
+        if not all(np.array_equal(a, b) for a, b in zip(after, other, strict=True)):
             name = agents.name_of(self.agent)
             raise UserError(f"reward is missing: {name} observes it. Give the reward that came with obs.")
+        self._ignores_reward = True
 
     def _fitting(self, state: Any, batch: int) -> State:
         """The same state, after a check that it is a state of this policy for `batch` episodes."""
@@ -262,6 +264,7 @@ def _environment(run: Run, task: Any) -> Any:
         UserError: it cannot be made.
     """
     found = task_of(run, task)
+    check_interface(run, found)
     return found.environment() if isinstance(found, GymnasiumTask) else TaskEnvironment(found)
 
 

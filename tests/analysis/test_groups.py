@@ -17,6 +17,7 @@ from beliefrl.analysis.aggregate import (
     scores,
 )
 from beliefrl.analysis.groups import find, groups, is_finished, last_step, left_out
+from beliefrl.analysis.results import cut
 from beliefrl.types import UserError
 from inputs import a_run, flat
 
@@ -319,3 +320,12 @@ def test_runs_are_found_through_links_and_a_link_in_a_circle_ends(tmp_path):
     (tmp_path / "links" / "first").symlink_to(tmp_path / "there" / "one")
     (tmp_path / "links" / "circle").symlink_to(tmp_path / "links")
     assert len(find([tmp_path / "links"]).runs) == 1
+
+
+def test_of_two_runs_of_a_seed_the_latest_counts_until_an_earlier_step_too(tmp_path):
+    made = [
+        a_run(tmp_path / name, [flat(value, value)], started=f"2026-01-0{day}T00:00:00+00:00")
+        for name, value, day in (("z", 1.0, 1), ("a", 2.0, 2))
+    ]
+    (group,) = groups([cut(run, 10) for run in made])
+    assert group.final().tolist() == [2.0]

@@ -20,6 +20,8 @@ from beliefrl.runs.folder import free_folder
 from beliefrl.runs.options import Options
 from beliefrl.runs.records import provenance
 from beliefrl.runs.run import Recorder, Run
+from beliefrl.training.evaluation import summary
+from beliefrl.training.rollout import Episode
 from beliefrl.types import UserError
 
 CONFIG = {
@@ -205,6 +207,8 @@ OTHER_TYPES = """
 import json, pathlib, sys
 from beliefrl.training.evaluation import agent_of
 from beliefrl.runs.run import Run
+from beliefrl.training.evaluation import summary
+from beliefrl.training.rollout import Episode
 from beliefrl.types import UserError
 config = json.loads(pathlib.Path("config.json").read_text())
 for part, wrong in (
@@ -369,3 +373,13 @@ def test_the_commit_is_not_that_of_a_project_around_the_package(tmp_path, monkey
     subprocess.run([*git, "add", "-f", str(inside)], check=True)
     subprocess.run([*git, "commit", "-q", "-m", "second"], check=True)
     assert re.fullmatch("[0-9a-f]{40}", provenance()["git_commit"])
+
+
+def test_a_measure_that_no_episode_has_can_be_read_again(recorder):
+    """`evaluation.summary` writes None for it."""
+    nan, returns = np.full((2, 2, 3), np.nan), np.ones((2, 2, 3))
+    result = summary(Episode(np.ones((2, 2, 3), bool), returns, returns.astype(int), {"time": nan}))
+    assert result["mode"]["time"] is None
+    assert result["mode"]["seeds_time"] == [None, None]
+    recorder.finish({"step": 7} | result)
+    assert Run(recorder.folder).results()["mode"]["seeds_time"] == [None, None]

@@ -267,7 +267,9 @@ def test_other_options_of_a_training_that_has_begun_are_refused_and_not_kept(tmp
     sweep(TWO, tmp_path)
     plan = (tmp_path / "sweep.json").read_text()
     other = grid(["vrm"], ["pendulum", "cartpole"], seeds=2, steps=20, eval_episodes=50)
-    with pytest.raises(UserError, match="was trained with eval_episodes=5, not 50: choose another --out"):
+    with pytest.raises(
+        UserError, match="was trained with eval_episodes=5, not 50: give that value, or choose another --out"
+    ):
         sweep(other, tmp_path)
     assert (tmp_path / "sweep.json").read_text() == plan
     assert len(sweep(TWO, tmp_path).finished) == 4

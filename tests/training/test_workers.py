@@ -49,9 +49,9 @@ def test_agents_are_evaluated_as_they_were_trained_each_in_its_process(tmp_path)
     (run.folder / "config.json").write_text(
         json.dumps(config | {"options": config["options"] | {"processes": "always"}})
     )
-    assert evaluate(Run(run.folder), 1, task=Single)["episodes"] == 1
+    assert evaluate(Run(run.folder), 1, task=Single, own_process=True)["episodes"] == 1
     with pytest.raises(UserError, match="only one simulation per process"):
-        evaluate(run, 1, task=Single)
+        evaluate(Run(run.folder), 1, task=Single)  # a script would start itself again
 
 
 def test_environments_in_this_process_leave_its_signals_alone(monkeypatch):

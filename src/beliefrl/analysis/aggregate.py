@@ -79,7 +79,7 @@ def bounds(task: str, final: dict[tuple[str, str], np.ndarray]) -> tuple[float, 
     of_task = [values for (of, _), values in final.items() if of == task]
     best = max((float(np.nanmean(values)) for values in of_task if np.isfinite(values).any()), default=1.0)
     lowest = min((float(np.nanmin(values)) for values in of_task if np.isfinite(values).any()), default=0.0)
-    return known_bounds(task) or ((0.0, best) if best > 0 else (min(lowest, best - 1e-6), best))
+    return known_bounds(task) or ((0.0, best) if best > 0 else (min(lowest, float(np.nextafter(best, -np.inf))), best))
 
 
 def known_bounds(task: str) -> tuple[float, float] | None:

@@ -144,6 +144,7 @@ def _folders(path: pathlib.Path) -> Iterator[pathlib.Path]:
         if real in seen:
             inside.clear()  # a link to a folder above
         else:
+            inside[:] = [name for name in inside if name not in ("checkpoints", "metrics", "tensorboard", "wandb")]
             seen.add(real)
             yield pathlib.Path(folder)
 

@@ -259,6 +259,10 @@ def model_loss(group: Group) -> Curve | None:
     if not found:
         return None
     table = np.array([means_between(rows, found[0], steps.tolist()) for rows in updates])
+    for seed in np.flatnonzero(group.stopped & ~group.diverged):  # as in `Group.curve`
+        known = np.flatnonzero(np.isfinite(table[seed]))
+        if known.size:
+            table[seed, known[-1] :] = table[seed, known[-1]]
     return Curve(steps, table).only(~np.all(np.isnan(table), axis=0))
 
 

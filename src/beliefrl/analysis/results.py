@@ -45,7 +45,7 @@ def cut(run: Run, until: int) -> KeptRun:
     """The run with only the rows up to `until` environment steps. When it reached them is not known."""
     rows = {seed: [row for row in run.rows(seed) if row["step"] <= until] for seed in run.seeds}
     is_cut = any(row["step"] > until for seed in run.seeds for row in run.rows(seed))
-    timeless = {name: value for name, value in run.config.items() if name not in ("started", "ended", "resumed")}
+    timeless = {name: value for name, value in run.config.items() if name not in ("ended", "resumed")}
     return KeptRun(run.folder, timeless if is_cut else run.config, rows)
 
 

@@ -179,10 +179,10 @@ def parse(options: Any, argv: Sequence[str], prog: str, advice: str = "") -> Any
 
 def _refuse_repeated(lists: Collection[str], argv: Sequence[str]) -> None:
     """Raise a UserError if an option with several values is given twice: the second would replace the first."""
-    given = [option for option in (arg.split("=")[0] for arg in argv) if option in lists]
+    given = [option for option in (arg.split("=")[0].replace("_", "-") for arg in argv) if option in lists]
     for option in given:
         if given.count(option) > 1:
-            raise UserError(f"{option} is given twice: give all its values at once, {option} A B.")
+            raise UserError(f"{option} is given twice: give all its values after one {option}.")
 
 
 def refuse_empty(argv: Sequence[str], *options: str) -> None:
@@ -265,7 +265,11 @@ def _option_names(options: Any) -> list[str]:
 
 def _lists(options: Any) -> set[str]:
     """The options that have several values."""
-    return {f"--{name.replace('_', '-')}" for name, kind in _fields(options) if "tuple[" in str(kind)}
+    kinds = (
+        (name, getattr(kind, "__origin__", kind) if hasattr(kind, "__metadata__") else kind)
+        for name, kind in _fields(options)
+    )
+    return {f"--{name.replace('_', '-')}" for name, kind in kinds if re.search(r"\b(tuple|list)\[", str(kind), re.I)}
 
 
 def _fields(options: Any) -> list[tuple[str, Any]]:

@@ -86,7 +86,9 @@ def evaluate(argv: Sequence[str]) -> None:
     agent, shown = own_agent(options.agent), not options.json
     elsewhere = contextlib.redirect_stdout(sys.stderr) if options.json else contextlib.nullcontext()
     with elsewhere:  # what an environment prints
-        results = play(run, options.episodes, options.seed, agent=agent, progress=shown, best=options.best)
+        results = play(
+            run, options.episodes, options.seed, agent=agent, progress=shown, best=options.best, own_process=True
+        )
     if options.json:
         print(json.dumps(json.loads(json.dumps(results), parse_constant=lambda _: None)))  # null for a diverged seed
         return
@@ -106,4 +108,4 @@ def export(argv: Sequence[str]) -> None:
         print(f"written to {options.file}: jax.export.deserialize reads it")
     else:
         print(f"written to {options.file}: onnxruntime reads it")
-        print(f"largest difference from the policy in an episode: {difference:.1g}")
+        print(f"largest difference from the policy: {difference:.1g}")

@@ -41,7 +41,7 @@ class Options:
     stop_patience: int = 1
     """Number of consecutive evaluations in which the returns must be at least stop_at."""
     init_from: str | None = None
-    """Folder of a run whose trained agent gives the initial networks. It must have the same agent and sizes. A seed
+    """Folder of a run whose trained agent gives the initial networks. It must have the same networks. A seed
     starts from the same seed there. If that run has fewer seeds, they are reused in a cycle. None: random networks."""
     init_best: bool = False
     """Take the best agent of init_from instead of its last one."""

@@ -188,9 +188,11 @@ def _is_mode(mode: Any, seeds: int) -> bool:
         return False
     for name in (key.removeprefix("seeds_") for key in mode if key.startswith("seeds_")):
         of_seeds, mean = mode[f"seeds_{name}"], mode.get(name)
-        if (of_seeds is None) != (mean is None):
+        if of_seeds is None and mean is None:
+            continue
+        if not (isinstance(of_seeds, list) and _are_known(of_seeds) and len(of_seeds) == seeds):
             return False
-        if of_seeds is not None and not (_are_known(of_seeds) and len(of_seeds) == seeds and _is_number(mean)):
+        if not (_is_number(mean) or (mean is None and not any(map(_is_number, of_seeds)))):  # in no episode a number
             return False
     return _are_known([mode["sem"], *returns])
 

@@ -21,6 +21,7 @@ from beliefrl.training.stop import Requests, Stopped
 from beliefrl.types import UserError, cause, check_whole, one_line, plain
 
 LOOK_EVERY = 0.5  # seconds
+HARMLESS = ("seed", "seeds", "processes", "checkpoint_steps", "checkpoint_minutes", "keep_checkpoints", "track")
 ALL = 10_000  # seeds in one run, more than any experiment has
 
 
@@ -124,10 +125,10 @@ def _check_options(folder: pathlib.Path, trainings: Sequence[Training]) -> None:
             continue
         there = dataclasses.asdict(Options()) | run.config["options"]
         for name, value in dataclasses.asdict(plans.options_of(training)).items():
-            if name not in (*CHANGEABLE, "seed", "seeds") and plain(there[name]) != plain(value):
+            if name not in (*CHANGEABLE, *HARMLESS) and plain(there[name]) != plain(value):
                 raise UserError(
-                    f"{run.folder} was trained with {name}={there[name]}, not {value}: choose another --out, in Python "
-                    "out=."
+                    f"{run.folder} was trained with {name}={there[name]}, not {value}: give that value, or choose "
+                    "another --out, in Python out=."
                 )
 
 

@@ -44,9 +44,9 @@ def check_actions(space: Any, name: str) -> None:
         raise UserError(
             f"{name} has actions of shape {space.shape}: give the Box at least one dimension and at least one number."
         )
-    with np.errstate(over="ignore"):
-        is_finite = np.isfinite(space.high.astype(np.float64) - space.low).all()
-    if not (space.is_bounded() and is_finite):
+    with np.errstate(over="ignore", invalid="ignore"):
+        width = space.high.astype(np.float64) - space.low
+    if not (space.is_bounded() and np.isfinite(width).all()):
         raise UserError(f"{name} has unbounded actions: give its Box finite bounds, to which [-1, 1] is scaled.")
     for entry in np.flatnonzero(space.low >= space.high):
         bound = space.low.reshape(-1)[entry]
@@ -106,7 +106,7 @@ def flat_bounds(space: Any) -> spaces.Box:
 
 
 def fits(space: Any, obs: Any) -> bool:
-    """Whether the parts of an observation have the sizes of their spaces, and integers are in them.
+    """Whether the parts of an observation have the sizes of their spaces, and integers where these have integers.
 
     `flatten` checks neither, and casts numbers to the type of the space.
     """

@@ -1,7 +1,7 @@
 """The same task with fewer entries of its observation, with faults, or with an action repeat."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import gymnasium
@@ -55,6 +55,8 @@ def observe(task: Any, indices: tuple[int, ...]) -> Any:
 
 
 def _observe_host(task: GymnasiumTask, indices: tuple[int, ...]) -> GymnasiumTask:
+    if isinstance(indices, str) or not isinstance(indices, Iterable):
+        check_indices(indices, 0)  # says what is wrong
     if task.indices is not None:
         check_indices(indices, len(task.indices))
         indices = tuple(task.indices[i] for i in indices)

@@ -111,10 +111,8 @@ def restore_policy(
 ) -> tuple[Agent, Spec, Interface | None, Any]:
     """The agent of a run, the sizes of its task, the interface of a Gymnasium environment, and the state of a seed.
 
-    Nothing is made if the run records the interface: the robot may be somewhere else, and must not move.
-
-    Raises:
-        UserError: as `restore_seed`.
+    Nothing is made if the run records the interface: the robot may be somewhere else, and must not move. Raises a
+    UserError as `restore_seed`.
     """
     _check_seed(run, seed)
     made, interface = agent_of(run, agent), Interface.recorded(run.config.get("interface"))
@@ -125,12 +123,12 @@ def restore_policy(
     else:
         with _naming(run):
             observed = Faults.of(run.config.get("faults")).observed_size(len(interface.entries))
-        spec = Spec(observed, len(interface.low), LARGEST)
+        spec = Spec(observed, len(interface.low), run.config.get("max_steps", LARGEST))
     return made, spec, interface, _of_seed(run, _states(run, made, spec, best), seed)
 
 
 def _check_seed(run: Run, seed: int | None) -> None:
-    """Raise a UserError if the run does not have this seed; None is its first."""
+    """Raise a UserError if the run does not have this seed."""
     if seed is not None and seed not in run.seeds:
         raise UserError(f"{run.folder} has no seed {seed}: it has {', '.join(map(str, run.seeds))}.")
 
@@ -233,6 +231,7 @@ def evaluate(
     agent: Agent | type | None = None,
     progress: bool = True,
     best: bool = False,
+    own_process: bool = False,
 ) -> dict[str, Any]:
     """Let the trained agents of a run play `episodes` new episodes, once with sampled and once with mode actions.
 
@@ -246,6 +245,7 @@ def evaluate(
             three seconds, and then once a minute.
         best: play with the best agent of each seed, not with its last one. It had the highest mean return, with sampled
             actions, of all evaluations during the training.
+        own_process: as in `train`. Then each environment of a run with processes="always" has a process of its own.
 
     Returns:
         {"episodes", "sampled": {"mean", "sem", "seeds", "success", "seeds_success"}, "mode": the same}. Returns are
@@ -264,7 +264,8 @@ def evaluate(
     keys = jax.random.split(jax.random.key(seed), len(run.seeds))
     with _showing(progress, 2 * episodes * len(run.seeds)) as ended, jax.default_matmul_precision(precision):
         if isinstance(found, GymnasiumTask):
-            result = _on_host(trained, found, states, keys, episodes, run, ended)
+            apart = own_process and run.options.processes == "always"  # an environment may need it
+            result = _on_host(trained, found, states, keys, episodes, run, ended, apart)
         else:
             compiled = jax.jit(jax.vmap(lambda state, key: evaluate_seed(trained, found, state, key, episodes)))
             result = jax.block_until_ready(compiled(states, keys))
@@ -288,9 +289,9 @@ def _on_host(
     episodes: int,
     run: Run,
     ended: Callable[[int], None],
+    apart: bool,
 ) -> Episode:
-    always = run.options.processes == "always"  # an environment may need a process of its own
-    how = ("always", None, run.options.step_timeout) if always else ("never", None, None)
+    how = ("always", None, run.options.step_timeout) if apart else ("never", None, None)
     shared = Lockstep(task, [f"seed {seed}" for seed in run.seeds], *how) if run.options.share_env else None
     evaluation = Evaluation(agent, task, run.seeds, *how, shared=shared)
     try:

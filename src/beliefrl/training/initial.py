@@ -140,6 +140,6 @@ def _fitting(source: Run, saved: dict[str, np.ndarray], agent: Agent, spec: Spec
         if there != here:
             raise UserError(
                 f"{source.folder} ({source.config['agent']} on {source.config['task']}) cannot be init_from: its "
-                f"{name.lstrip('.')} has {there}, this training's has {here}; the agent and all sizes must be the same."
+                f"{name.lstrip('.')} has {there}, this training's has {here}; the networks must be the same."
             )
     return {name: saved[name] for name in wanted}

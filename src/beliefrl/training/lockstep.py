@@ -100,8 +100,10 @@ class Lockstep:
     def _processes(self, factories: list["_Factory"]) -> AsyncVectorEnv:
         # Forking a process in which JAX runs threads may never return. A daemon could not start processes of its own.
         settings: dict[str, Any] = {"context": "spawn", "daemon": False, "autoreset_mode": AutoresetMode.DISABLED}
-        envs = AsyncVectorEnv(factories, **settings)
-        jax.config.update("jax_enable_x64", self._is_wide)  # an environment was made here too, to see its spaces
+        try:
+            envs = AsyncVectorEnv(factories, **settings)
+        finally:  # an environment was made here too, to see its spaces
+            jax.config.update("jax_enable_x64", self._is_wide)
         atexit.register(self.close)  # at its exit Python would wait for processes that ignore SIGTERM
         return envs
 

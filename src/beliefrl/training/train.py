@@ -4,13 +4,14 @@ import contextlib
 import copy
 import dataclasses
 import os
+import pathlib
 from collections.abc import Iterator
 from typing import Any, Literal
 
 from beliefrl import agents, tasks
 from beliefrl.agents import Agent, hyperparameters
 from beliefrl.runs.checkpoint import listed, was_ever_written
-from beliefrl.runs.folder import free_folder, write_config
+from beliefrl.runs.folder import free_folder, locked, write_config
 from beliefrl.runs.records import provenance
 from beliefrl.runs.run import Recorder, Run
 from beliefrl.tasks import Task
@@ -78,7 +79,7 @@ def train(
         "hyperparameters": hyperparameters.of(agent),
         **tasks.describe(made),
         "options": dataclasses.asdict(chosen),
-        **({"interface": made.interface._asdict()} if isinstance(made, GymnasiumTask) else {}),
+        **(_about_environment(made) if isinstance(made, GymnasiumTask) else {}),
         **provenance(),
     }
     if resume and out is not None and os.path.exists(os.path.join(out, "config.json")):  # noqa: PTH110, PTH118 - pathlib's raises where a name is too long
@@ -140,6 +141,11 @@ def resume(
     return _go_on(run, changes, task, (report, callback), agent, own_process, progress)
 
 
+def _about_environment(task: GymnasiumTask) -> dict[str, Any]:
+    """What `load` needs to know of an environment that is not there."""
+    return {"interface": task.interface._asdict(), "max_steps": task.spec.max_steps}
+
+
 def _go_on(
     run: Run,
     changes: dict[str, Any],
@@ -173,6 +179,7 @@ def _go_on(
         _ = capacity(made_by, options)  # raise before the run's config changes
         checks.possible(options, made, own_process)
         earlier = copy.deepcopy(recorder.config)
+        stack.callback(_put_back, folder, earlier)  # if something fails before the training begins
         recorder.amend({"options": dataclasses.asdict(options)}, provenance())
         listen = showing.enter_context(_reporting(recorder, *listeners, progress))
         training = Session(recorder, made_by, made, options, listen, own_process)
@@ -194,8 +201,13 @@ def _run_restored(training: Session, earlier: dict[str, Any]) -> Run:
         return training.run(restore)
     finally:
         if not read:
-            with contextlib.suppress(OSError):
-                write_config(training.recorder.folder, earlier)
+            with contextlib.suppress(UserError), locked(training.recorder.folder, "is being trained"):
+                _put_back(training.recorder.folder, earlier)
+
+
+def _put_back(folder: pathlib.Path, config: dict[str, Any]) -> None:
+    with contextlib.suppress(OSError):
+        write_config(folder, config)
 
 
 class _OfCallback(Exception):
