@@ -444,3 +444,19 @@ def test_bounds_whose_distance_is_not_finite_are_no_bounds():
     space = spaces.Box(-largest, largest, (1,), np.float64)
     with pytest.raises(UserError, match="unbounded actions"):
         _ = GymnasiumTask(spaced(action_space=space)).spec
+
+
+def test_what_an_environment_says_when_it_is_made_is_seen(tmp_path, monkeypatch, capfd):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "talking.py").write_text(
+        "import gymnasium\n"
+        "from wrong import Fine\n"
+        "class Talking(Fine):\n"
+        "    def __init__(self):\n"
+        "        print('turn the robot on', flush=True)\n"
+        "        super().__init__()\n"
+        "gymnasium.register('Talking-v0', Talking)\n"
+        "print('imported', flush=True)\n"
+    )
+    _ = tasks.make("gym:talking:Talking-v0").spec
+    assert capfd.readouterr().out.split("\n")[:2] == ["imported", "turn the robot on"]

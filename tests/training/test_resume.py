@@ -502,3 +502,13 @@ def test_a_resume_that_finds_damaged_results_changes_nothing(whole, tmp_path):
     with pytest.raises(UserError, match=r"results\.json is damaged"):
         resume(folder, steps=360)
     assert (folder / "config.json").read_text() == before
+
+
+def test_evaluate_says_of_which_seed_the_agent_is_older(tmp_path, capsys):
+    run = saved(tmp_path / "run", "sac-mlp", make("pendulum-v", max_steps=5), seeds=2)
+    with (run.folder / "metrics" / "seed-5.jsonl").open("a") as log:
+        log.write(json.dumps({"step": 1500, "kind": "diverged", "why": "a loss is not finite"}) + "\n")
+    main(["evaluate", str(run.folder), "--episodes", "1"])
+    out = capsys.readouterr().out
+    assert "seed 5 diverged by step 1,500: its agent is from an evaluation before that" in out
+    assert "seed 4 diverged" not in out

@@ -95,6 +95,9 @@ def evaluate(argv: Sequence[str]) -> None:
     which = ", best agents" if options.best else ""
     title = f"{run.config['agent']} on {run.config['task']}, {options.episodes} episodes per seed{which}"
     Console().print(results_table(results, run.seeds, title))
+    for seed in run.seeds:
+        for row in run.rows(seed, "diverged"):
+            print(f"seed {seed} diverged by step {row['step']:,}: its agent is from an evaluation before that")
 
 
 def export(argv: Sequence[str]) -> None:

@@ -66,7 +66,7 @@ def make(id: str, arguments: dict[str, Any], name: str | None = None) -> Gymnasi
 def _import(package: str, id: str) -> None:
     wide = jax.config.read("jax_enable_x64")
     try:
-        with _quiet():
+        with _quiet(package):
             importlib.import_module(package)
         jax.config.update("jax_enable_x64", wide)  # it would change the training
     except ModuleNotFoundError as found:
@@ -84,7 +84,7 @@ class _Registered:
     def __call__(self, **arguments: Any) -> gymnasium.Env[Any, Any]:
         package, _, name = self.id.rpartition(":")
         try:
-            with _quiet() if package else contextlib.nullcontext():
+            with _quiet(package):
                 if package:
                     importlib.import_module(package)  # a new process has not imported it yet
                 environment = gymnasium.make(name, disable_env_checker=True, **arguments)
@@ -108,8 +108,11 @@ def _first_sentence(found: Exception) -> str:
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Suppress all output: PyBullet prints from C when it is imported and when an environment starts."""
+def _quiet(package: str) -> Iterator[None]:
+    """Suppress all output of PyBullet, which prints from C when it is imported and when an environment starts."""
+    if package != BULLET:  # it may ask something
+        yield
+        return
     streams = (1, 2)
     sys.stdout.flush()
     kept = [os.dup(stream) for stream in streams]
