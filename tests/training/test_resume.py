@@ -497,7 +497,7 @@ def test_a_seed_that_has_never_had_an_agent_is_not_loaded(tmp_path):
 def test_a_resume_that_finds_damaged_results_changes_nothing(whole, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(whole[0], folder)
-    (folder / "results.json").write_text("{}")
+    (folder / "results.json").write_text('{"step": 240}')
     before = (folder / "config.json").read_text()
     with pytest.raises(UserError, match=r"results\.json is damaged"):
         resume(folder, steps=360)
