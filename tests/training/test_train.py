@@ -236,7 +236,7 @@ def test_a_seed_starts_from_its_number_and_others_in_turn(source):
 @pytest.mark.parametrize(
     ("agent", "task", "phrase"),
     [
-        (AGENT, "pendulum", r"weight has the shape \(8, 1\), this training's has the shape \(8, 3\); the agent and"),
+        (AGENT, "pendulum", r"weight has the shape \(8, 1\), this training's has the shape \(8, 3\); the networks"),
         (tiny("sac-lstm"), "pendulum-v", r"lstm\.\S+ has no such array, this training's has the shape"),
         (tiny("sac-mlp", standardise=True), "pendulum-v", r"scale\.mean has no such array, this training's has"),
     ],

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from beliefrl import UserError, evaluate, train
+from beliefrl import UserError, evaluate, tasks, train
 from beliefrl.errors import Fault
 from beliefrl.runs.run import Run
 from beliefrl.tasks.gymnasium import GymnasiumTask
@@ -114,3 +114,31 @@ def test_no_more_environments_are_made_than_are_needed(tmp_path):
     task = GymnasiumTask(Counted, indices=(0,))
     train(agent, task, tmp_path / "run", steps=40, eval_every=20, eval_episodes=1, share_env=True, progress=False)
     assert Counted.made == 2  # one for its sizes, and one for all the rest
+
+
+def test_a_script_with_an_object_as_an_argument_can_be_started_again(tmp_path):
+    """The object has another address then, which is all that its text says."""
+
+    class Gain:
+        pass
+
+    options = {"steps": 40, "eval_every": 40, "eval_episodes": 1, "resume": True, "progress": False}
+    agent = tiny("sac-mlp", step_start_rl=20, batch_size=8, pretrain_updates=5)
+    for _ in range(2):
+        task = GymnasiumTask(Fine, arguments={"gain": Gain(), "speed": 2.0})
+        run = train(agent, task, tmp_path / "run", **options)
+    assert run.results()["step"] == 40
+    with pytest.raises(UserError, match="was trained with constants="):
+        train(agent, GymnasiumTask(Fine, arguments={"gain": Gain(), "speed": 3.0}), tmp_path / "run", **options)
+
+
+def test_a_package_that_switches_to_64_bits_when_it_is_imported_does_not_change_the_training(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "wide.py").write_text(
+        "import gymnasium, jax\n"
+        "from wrong import Fine\n"
+        "jax.config.update('jax_enable_x64', True)\n"
+        "gymnasium.register('Wide-v0', Fine)\n"
+    )
+    _ = tasks.make("gym:wide:Wide-v0").spec
+    assert not jax.config.read("jax_enable_x64")

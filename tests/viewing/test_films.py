@@ -1,6 +1,7 @@
 """Videos, film strips and demos: every frame at its time, and no half-written file."""
 
 import fnmatch
+import os
 import pathlib
 import re
 import subprocess
@@ -274,3 +275,21 @@ def test_with_a_display_a_demo_opens_a_window_and_writes_nothing(tmp_path, no_di
     assert paths == [None, pathlib.Path("film.gif"), pathlib.Path("beliefrl-demo-pendulum-v.gif")]
     assert list(tmp_path.iterdir()) == []
     capsys.readouterr()
+
+
+def test_an_environment_that_changes_the_working_directory_does_not_move_the_film(tmp_path, monkeypatch):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "here").mkdir()
+
+    class Moving(Counter):
+        def __init__(self, render_mode=None):
+            super().__init__(render_mode)
+            os.chdir(tmp_path / "elsewhere")
+
+    monkeypatch.chdir(tmp_path / "here")
+    task = GymnasiumTask(Moving)
+    run = saved(tmp_path / "run", "sac-mlp", task)
+    os.chdir(tmp_path / "here")
+    films.video(run, "film.gif", fps=20.0, steps=2, task=task)
+    assert (tmp_path / "here" / "film.gif").exists()
+    assert not any((tmp_path / "elsewhere").iterdir())
