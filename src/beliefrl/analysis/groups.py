@@ -62,7 +62,7 @@ class Group:
     @cached_property
     def stopped(self) -> np.ndarray:
         """Which seeds have ended at their `stop_at`, (seed,)."""
-        return np.array([run.reached(run.options.stop_at, run.options.stop_patience) for run, _ in self.seeds])
+        return np.array([_has_stopped(run) for run, _ in self.seeds])
 
     def curve(self, name: str = "sampled") -> Curve:
         """An entry of the evaluations (sampled, mode, sampled_success, ...), at steps that all seeds have.
@@ -83,6 +83,13 @@ class Group:
         curve = self.curve(name)
         last = curve.seeds[:, -1] if curve.steps.size else np.full(len(self.seeds), np.nan)
         return np.where(self.diverged, np.nan, last)
+
+    @property
+    def why_no_curve(self) -> str | None:
+        """Why there is no curve; None if there is one."""
+        if self.curve().steps.size:
+            return None
+        return "all seeds have diverged" if self.diverged.all() else "its seeds have no evaluation at the same step"
 
     @property
     def measures(self) -> list[str]:
@@ -155,10 +162,13 @@ def _is_run(folder: pathlib.Path) -> bool:
 
 def is_finished(run: Run) -> bool:
     """Whether every seed has been evaluated at the last step, or has diverged, or all have reached `stop_at`."""
-    options = run.options
-    if run.reached(options.stop_at, options.stop_patience):
+    if _has_stopped(run):
         return True
-    return all(_diverged(run, seed) or last_step(run, seed) >= options.steps for seed in run.seeds)
+    return all(_diverged(run, seed) or last_step(run, seed) >= run.options.steps for seed in run.seeds)
+
+
+def _has_stopped(run: Run) -> bool:
+    return run.reached(run.options.stop_at, run.options.stop_patience)
 
 
 def last_step(run: Run, seed: int) -> int:
@@ -223,9 +233,9 @@ def left_out(runs: Sequence[Run], shown: Sequence[Group]) -> list[str]:
         if seeds
     ]
     return twice + [
-        f"left out: {group.label} on {group.task}: its seeds have no evaluation at the same step"
+        f"left out: {group.label} on {group.task}: {group.why_no_curve}"
         for group in shown
-        if not (group.diverged.all() or group.curve().steps.size)
+        if group.why_no_curve and not group.diverged.all()
     ]
 
 

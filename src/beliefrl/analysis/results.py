@@ -42,7 +42,7 @@ class KeptRun(Run):
 
 
 def cut(run: Run, until: int) -> KeptRun:
-    """The run with only the rows up to `until` environment steps. When it reached them is not known."""
+    """The run with only the rows up to `until` environment steps. Its time is then unknown."""
     rows = {seed: [row for row in run.rows(seed) if row["step"] <= until] for seed in run.seeds}
     is_cut = any(row["step"] > until for seed in run.seeds for row in run.rows(seed))
     timeless = {name: value for name, value in run.config.items() if name not in ("ended", "resumed")}

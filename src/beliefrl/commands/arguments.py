@@ -265,17 +265,15 @@ def _option_names(options: Any) -> list[str]:
 
 def _lists(options: Any) -> set[str]:
     """The options that have several values."""
-    kinds = (
-        (name, getattr(kind, "__origin__", kind) if hasattr(kind, "__metadata__") else kind)
-        for name, kind in _fields(options)
-    )
-    return {f"--{name.replace('_', '-')}" for name, kind in kinds if re.search(r"\b(tuple|list)\[", str(kind), re.I)}
+    several = re.compile(r"\b(tuple|list)\[", re.IGNORECASE)
+    return {f"--{name.replace('_', '-')}" for name, kind in _fields(options) if several.search(str(kind))}
 
 
 def _fields(options: Any) -> list[tuple[str, Any]]:
     """The name and type of all fields of a dataclass and of the dataclasses in it."""
     found = []
     for field in dataclasses.fields(options):
-        kind = getattr(field.type, "__origin__", field.type)
-        found += _fields(kind) if dataclasses.is_dataclass(kind) else [(field.name, field.type)]
+        kind: Any = field.type
+        kind = kind.__origin__ if hasattr(kind, "__metadata__") else kind  # of Annotated
+        found += _fields(kind) if dataclasses.is_dataclass(kind) else [(field.name, kind)]
     return found

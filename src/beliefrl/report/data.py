@@ -49,7 +49,7 @@ def page_data(runs: Sequence[Run], page_folder: pathlib.Path, unfinished: bool =
     """
     counted = [run for run in runs if is_finished(run) or (unfinished and _has_begun(run))]
     grouped = groups(counted, agents.defaults(), agents.before())
-    lines = [group for group in grouped if group.curve().steps.size]
+    lines = [group for group in grouped if not group.why_no_curve]
     group_of = {(run.folder, seed): index for index, group in enumerate(lines) for run, seed in group.seeds}
     placed = {(run.folder, seed) for group in grouped for run, seed in group.seeds}
     elsewhere = {run.folder: [seed for seed in run.seeds if (run.folder, seed) not in placed] for run in counted}
@@ -59,19 +59,15 @@ def page_data(runs: Sequence[Run], page_folder: pathlib.Path, unfinished: bool =
         "tasks": list(dict.fromkeys(group.task for group in lines)),
         "labels": [{"name": label, "colour": colour, "dash": dash[label]} for label, colour in palette.items()],
         "groups": [_group(group) for group in lines],
-        "without_curve": [_without_curve(group) for group in grouped if group not in lines],
+        "without_curve": [
+            f"{each.label} on {each.task} has no curve: {why}" for each in grouped if (why := each.why_no_curve)
+        ],
         "runs": [
             _run(run, page_folder, [group_of.get((run.folder, seed)) for seed in run.seeds])
             | {"elsewhere": elsewhere.get(run.folder, [])}
             for run in runs
         ],
     }
-
-
-def _without_curve(group: Group) -> str:
-    lost = group.diverged.all()
-    why = "all seeds have diverged" if lost else "its seeds have no evaluation at the same step"
-    return f"{group.label} on {group.task} has no curve: {why}"
 
 
 def _has_begun(run: Run) -> bool:

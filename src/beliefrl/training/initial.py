@@ -23,8 +23,8 @@ from beliefrl.types import Spec, UserError, plain
 
 FILE = "initial.safetensors"
 MEANING = {"normalise_critics": False, "critic_likelihood": False, "reward_memory": (), "observation_memory": ()}
-"""Hyperparameters that change what the arrays mean, and their value in an agent without them. Of those with False it
-only matters whether they are on."""
+"""Hyperparameters that change what the arrays mean, and their value in an agent without them. For those with False it
+matters only whether they are on."""
 
 
 def seeds_there(options: Options) -> list[int]:
