@@ -32,8 +32,8 @@ Reinforcement learning under partial observability: the agent observes only a pa
 
 for example
 
-  beliefrl train predictive-sac pendulum-v --steps 15000 --seeds 3 --out runs/first
-  beliefrl evaluate runs/first --episodes 20
+  beliefrl train predictive-sac pendulum-v --steps 15000 --seeds 3 --out runs/pendulum
+  beliefrl evaluate runs/pendulum --episodes 20
   beliefrl train vrm target-reaching --steps 60000 --gamma 0.98
   beliefrl train predictive-sac gym:MountainCarContinuous-v0 --observe 0 --seeds 2
   beliefrl train my_module:MyAgent pendulum-p

@@ -28,7 +28,8 @@ class SweepOptions:
     tasks: tuple[str, ...] = ()
     """Names of the tasks."""
     seeds: int | None = None
-    """Number of seeds per experiment, starting at --seed. None: as in the paper (5; sensitivity 20), 2 with --scale."""
+    """Number of seeds per experiment, starting at --seed. None: as in the paper (5; sensitivity 20; scalability
+    1) or in FILE, and 2 with --scale."""
     seed: int | None = None
     """Number of the first seed. Without --seeds, the numbers of all seeds are shifted so that the lowest is this one.
     None: 0, or as FILE has them."""
@@ -48,7 +49,8 @@ class SweepOptions:
     workers: int | None = None
     """Maximum number of trainings at a time. None: as many as there are cores (or GPUs)."""
     seeds_per_run: int | None = None
-    """Maximum number of seeds side by side in one program. None: one on a core (sac-mlp: all), all on a GPU."""
+    """Maximum number of seeds side by side in one program. None: one on a core (all of sac-mlp on a JAX task), all on a
+    GPU."""
     ray: Annotated[str | None, tyro.conf.arg(metavar="auto|ADDRESS")] = None
     """Run on a Ray cluster. ADDRESS is HOST:PORT of its head, or auto for a head on this machine. Needs the extra
     `sweep`, and a folder that all machines of the cluster see."""

@@ -95,7 +95,8 @@ def predictions(
         seed: one of the run's seeds; None: its first.
         model: "lstm" for predictive-sac, "keep" or "first" for vrm, "latent" for slac; None: the first of these that
             the agent has.
-        start: number of timesteps that the closed loop observes; None: 50, or half of a shorter episode.
+        start: number of timesteps that the closed loop observes; None: 50, or half of an episode of
+            less than 100.
         horizon: number of timesteps that it predicts after that, at most to the end of the episode.
         samples: number of samples in the mean of each prediction.
         episode_seed: random seed of the episode, its actions and the samples.
@@ -113,7 +114,8 @@ def predictions(
     trained, found, state, precision = restore_seed(run, seed, task, agent, best)
     name = _model(run, trained, model)
     with Player(trained, found, state, precision) as player:
-        steps = player.play(episode_seed, sampled, (START if start is None else start) + horizon - 1).steps
+        longest = max(2 * START, START + horizon) if start is None else start + horizon
+        steps = player.play(episode_seed, sampled, longest - 1).steps
     length = len(steps.reward)
     start = min(START, length // 2) if start is None else start
     if start >= length:
