@@ -20,7 +20,7 @@ from beliefrl.policy import Policy
 from beliefrl.tasks.environment import TaskEnvironment
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import host_loop, phases
-from beliefrl.types import UserError
+from beliefrl.types import UserError, tuples
 from beliefrl.viewing.episodes import Player
 from worlds import Counting, CountingAgent, installed
 
@@ -122,7 +122,7 @@ def test_what_a_record_lacks_has_the_value_from_before_it_existed():
     assert made.lr_model_min >= made.lr_model  # the learning rate is constant
     for name, values in agents.before().items():
         assert values.keys() <= hyperparameters.of(named(name)).keys()
-        hyperparameters.build(named(name), values)  # they are possible
+        hyperparameters.build(named(name), tuples(values))  # they are possible
 
 
 def test_dataclasses_in_an_agent_are_restored_and_functions_kept():

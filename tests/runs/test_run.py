@@ -351,6 +351,7 @@ def test_free_folder_takes_the_first_free_number(tmp_path):
     (tmp_path / "vrm-pendulum-1").mkdir()
     (tmp_path / "vrm-pendulum-3").mkdir()
     assert free_folder("vrm-pendulum", parent) == tmp_path / "vrm-pendulum-2"
+    assert free_folder("v" * 300, parent) == tmp_path / ("v" * 300 + "-1")  # `Recorder` says that this is too long
 
 
 def test_provenance_says_what_a_run_was_made_with():

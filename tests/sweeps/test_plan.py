@@ -77,6 +77,8 @@ def test_a_sweep_passes_on_how_trainings_start_and_end(tmp_path):
     recorder.log(3, "evaluation", 35, {"sampled": [-200.0], "mode": [-999.0]})
     assert training.is_finished(tmp_path)
     recorder.close()
+    (tmp_path / training.name / "config.json").write_text("{")
+    assert not training.is_finished(tmp_path)  # the training says that its run is damaged
 
 
 def test_a_sweep_that_grows_trains_no_seed_twice():
@@ -92,6 +94,8 @@ def test_a_sweep_that_grows_trains_no_seed_twice():
 
 
 def test_entries_are_the_same_as_numbers_and_as_text(tmp_path):
+    whole = (Experiment("vrm", "pendulum", seeds=(0,), observe=observe) for observe in (None, ()))
+    assert len({plan([each])[0].name for each in whole}) == 1
     number, text = (Experiment("vrm", "pendulum", seeds=(0,), observe=observe) for observe in ((0,), "0"))
     assert plan([number]) == plan([text]) == extended(plan([number]), [text])
     assert plan([Experiment("vrm", "pendulum", observe="velocities")])[0].observe == ("velocities",)
@@ -166,7 +170,7 @@ def test_every_mistake_is_found_before_anything_begins(experiment, phrase):
 
 
 def test_options_of_a_training_cannot_be_varied():
-    with pytest.raises(UserError, match="only hyperparameters can have several values"):
+    with pytest.raises(UserError, match="an option of the training can have only one value"):
         plan(grid(["vrm"], ["pendulum"], {"steps": [10, 20]}))
 
 

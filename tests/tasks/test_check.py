@@ -14,6 +14,8 @@ from beliefrl.types import UserError
 from worlds import Counting
 from wrong import BOX, UNSUPPORTED, Dictionary, Endless, Fine, spaced, with_observation
 
+WIDE = spaces.Box(-1e6, 1e6, (2,), np.float32)
+
 
 def warned(make, **task):
     """The warnings about an environment, which is not refused."""
@@ -131,6 +133,11 @@ def test_entries_that_do_not_exist_are_refused_beside_those_that_do():
         ({"observe": lambda self: np.array([0.5, 3.0 + self.time])}, "Entry 1 left the declared range"),
         ({"observe": lambda self: np.array([self.time / 9.0, 0.25])}, "Entry 1 never changed"),
         ({"observe": lambda self: np.array([self.time / 9.0, self.time / 9e3])}, "Entry 1 up to 0.00111"),
+        ({"observe": lambda self: np.array([self.time / 9.0, self.time / 9e3])}, "Entry 1 changed by less than 0.001"),
+        (
+            {"observe": lambda self: np.array([self.time, 1e5 + self.time % 2]), "observation_space": WIDE},
+            "Entry 1 changed little around a large mean",
+        ),
         ({"reward": lambda self: 0.0}, "The reward was always 0"),
     ],
 )

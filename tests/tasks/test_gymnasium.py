@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
+import beliefrl
 from beliefrl import catalogue, tasks
 from beliefrl.errors import Fault
 from beliefrl.tasks import seen_environment
+from beliefrl.tasks.faults import Faults
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.interface import Interface
 from beliefrl.tasks.registered import _Registered
@@ -110,10 +112,44 @@ def test_making_an_environment_changes_neither_the_working_directory_nor_jax(tmp
             os.chdir("/")
             jax.config.update("jax_enable_x64", True)
 
+    class Failing(Moving):
+        def __init__(self):
+            super().__init__()
+            raise OSError("no port")
+
     monkeypatch.chdir(tmp_path)
     assert GymnasiumTask(Moving).spec.obs_dim == 2
-    assert pathlib.Path.cwd() == tmp_path
+    assert not beliefrl.check(Moving, steps=3).refusals
+    for look in (lambda: GymnasiumTask(Failing).spec, lambda: beliefrl.check(Failing)):
+        with pytest.raises(UserError, match="cannot be made: OSError: no port"):
+            look()
+    with pytest.raises(UserError, match="cannot be made: OSError: no port"):
+        Lockstep(GymnasiumTask(Failing), ["seed 0"], "never")
     assert not jax.config.read("jax_enable_x64")
+    monkeypatch.chdir(tmp_path)  # the environments of a training stay where they moved
+    assert pathlib.Path.cwd() == tmp_path
+
+
+@pytest.mark.parametrize(
+    ("actions", "task"),
+    [
+        (Fine.action_space, {"indices": (7,)}),
+        (Fine.action_space, {"faults": Faults(noise=(0.1, 0.2, 0.3))}),
+        (spaces.Discrete(2), {}),
+    ],
+)
+def test_an_environment_that_is_refused_is_closed(actions, task):
+    closed = []
+
+    class Robot(Fine):
+        action_space = actions
+
+        def close(self):
+            closed.append(True)
+
+    with pytest.raises(UserError):
+        GymnasiumTask(Robot, **task).environment()
+    assert closed
 
 
 def test_a_text_in_place_of_a_tuple_of_measures_is_an_error(unchecked):

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from beliefrl import tasks
-from beliefrl.tasks import TASKS, describe, entry_names, make, names, observe, with_action_repeat, with_faults
-from beliefrl.tasks.given import given
+from beliefrl.tasks import TASKS, describe, entry_names, given, make, names, observe, with_action_repeat, with_faults
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.pendulum import Pendulum
 from beliefrl.tasks.target_reaching import TargetReaching

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from beliefrl.models import reading
 from beliefrl.training import replay as ring
 from beliefrl.training import rollout
 from beliefrl.types import StoredTimestep, Timestep, UserError, WindowShape, transitions
@@ -304,6 +305,28 @@ def test_after_a_jump_another_window_follows():
             found |= set(numbers(window)[:, 0].tolist())
         assert max(found) <= most
         assert len(found) > most // 2
+
+
+@pytest.mark.parametrize("count", [3, 5, 6, 8, 9, 12, 13, 16])
+def test_readers_learn_from_every_transition_of_a_short_ring(count):
+    replay = filled(64, np.arange(count) == 0)
+    readers, known = ring.init_readers(SHAPE), set()
+    for key in range(60):
+        window, readers = read(replay, readers, jax.random.key(key))
+        rows, valid = numbers(window), np.asarray(reading.known_transitions(window)).T
+        known |= set(rows[:, :-1][valid].tolist())
+    assert known == set(range(count - 1))
+
+
+def test_a_jump_into_the_first_window_of_a_ring_goes_to_its_first_timestep_if_an_episode_begins_there():
+    for starts, expected in ((np.arange(40) == 0, {0, *range(4, 32)}), (np.arange(40) == 5, set(range(32)))):
+        replay, found = filled(64, starts), []
+        for key in range(400):
+            window, _ = read(replay, ring.init_readers(SHAPE), jax.random.key(key))
+            found += numbers(window)[:, 0].tolist()
+        assert set(found) == expected
+        if starts[0]:
+            assert found.count(0) > 2 * found.count(10)  # four places lead there
 
 
 def test_readers_jump_with_the_given_probability():

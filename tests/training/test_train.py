@@ -291,6 +291,29 @@ def test_other_time_constants_are_one_sentence_though_all_shapes_are_equal(tmp_p
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize(
+    ("name", "setting"), [("vrm", "deterministic"), ("sac-lstm", "perceive_action"), ("sac-lstm", "perceive_reward")]
+)
+def test_other_meanings_of_equal_arrays_are_one_sentence(tmp_path, name, setting):
+    other = {"perceive_action": "perceive_reward", "perceive_reward": "perceive_action"}.get(setting)
+    source = saved(tmp_path / "source", name, TASK, agent=tiny(name, **{setting: True}))
+    with pytest.raises(UserError, match=r"trained with \S+=\S+, and this training has \S+; set \S+="):
+        train(tiny(name, **({other: True} if other else {})), TASK, tmp_path / "run", init_from=source)
+
+
+def test_agents_that_were_not_pretrained_are_refused(tmp_path):
+    agent = tiny("predictive-sac")
+    source = saved(tmp_path / "source", "predictive-sac", TASK, agent=agent)
+    early, late = agent.step_start_rl, agent.step_start_rl + 1
+    options = Options(init_from=str(source.folder), seed=4)
+    log = source.folder / "metrics" / "seed-4.jsonl"
+    log.write_text(json.dumps({"kind": "evaluation", "step": early, "sampled": [-1.0], "mode": [-1.0]}) + "\n")
+    with pytest.raises(UserError, match=rf"its agent was saved at step {early:,}, before the pre-training"):
+        initial.taken(options, agent, TASK.spec)
+    log.write_text(log.read_text().replace(f'"step": {early}', f'"step": {late}'))
+    initial.taken(options, agent, TASK.spec)
+
+
 @pytest.mark.slow
 def test_a_training_starts_there_without_pretraining_and_needs_the_other_run_no_more(source, tmp_path):
     networks = arrays.load(source.agents())

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from beliefrl.imports import path
-from beliefrl.types import UserError, said, tuples
+from beliefrl.types import UserError, plain, said, tuples
 
 Scale = Literal["linear", "log", "horizon"]
 
@@ -76,7 +76,7 @@ def values_before(agent: Any) -> dict[str, Any]:
 
     They are in the class attribute `values_before` of an agent. A hyperparameter that is not there had its default.
     """
-    return dict(getattr(agent, "values_before", {}))
+    return plain(dict(getattr(agent, "values_before", {})))
 
 
 def restored(agent: Any, recorded: Mapping[str, Any]) -> Any:

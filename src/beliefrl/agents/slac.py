@@ -72,7 +72,8 @@ class SLACAgent(SACAgent):
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""
         super().__post_init__()
-        check_range(self, ("seq_len", "batch_size", "train_interval_model"), 1)
+        check_range(self, ("seq_len",), 2)  # the first timestep of a window trains neither the prior nor the reward
+        check_range(self, ("batch_size", "train_interval_model"), 1)
         check_range(self, ("history", "z1_size", "z2_size", "model_layers"), 1, WIDEST)
         check_range(self, ("pretrain_updates",), 0)
         check_range(self, ("lr_model",), 0, 1)
@@ -204,12 +205,12 @@ class SLACAgent(SACAgent):
         batch = self.transitions(windows, belief, actor_input=self.histories(windows.step))
         return split_updates(batch, self.batch_size)
 
-    def histories(self, step: Timestep) -> Float[Array, "length batch actor_input"]:
+    def histories(self, step: Timestep) -> Float[Array, "time batch actor_input"]:
         """The actor's input at each timestep after the burn-in of windows (time-major)."""
         x, time = perception(step), jnp.arange(step.reward.shape[0])
         begun = jax.lax.cummax(jnp.where(step.is_first, time[:, None], 0))  # index of the episode's first timestep
         back = time[self.history - 1 :, None] - jnp.arange(self.history)[::-1][None]
-        index = jnp.maximum(back[:, :, None], begun[self.history - 1 :, None])  # (length, history, batch)
+        index = jnp.maximum(back[:, :, None], begun[self.history - 1 :, None])  # (time, history, batch)
         actor_input = x[index, jnp.arange(x.shape[1])].swapaxes(1, 2)
         return actor_input.reshape(*actor_input.shape[:2], -1)
 

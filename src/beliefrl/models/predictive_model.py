@@ -11,7 +11,7 @@ of unusual rewards. Each has entries for its time constants T, in the units of t
     J_model              = E ‖prediction - (o_{t+1}, r_t)‖²,  mean over the entries
 
 To predict, h_t must contain the information of the history about the hidden state. Some cells start with a long
-memory: the biases of their forget gates are log U(1, T), so their time constants are 2 to T + 1 steps (Tallec and
+memory: the biases of their forget gates are log U(1, L), so their time constants are 2 to L + 1 steps (Tallec and
 Ollivier 2018, "chrono initialisation", but with the usual biases of the input gates). An LSTM with the usual biases
 forgets an event within some tens of steps. Predictions one step ahead do not train it to remember longer.
 

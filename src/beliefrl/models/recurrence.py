@@ -50,10 +50,10 @@ def unroll(cell: Cell, weights: Any, start: Any, given: Any, is_first: Bool[Arra
     Differentiable in weights, start and given. Leaves of `start` are (batch, size), of `given` and `noise`
     (time, batch, size).
     """
-    return scan(cell, weights, start, given, is_first, noise)[0]
+    return _scan(cell, weights, start, given, is_first, noise)[0]
 
 
-def scan(cell: Cell, weights: Any, start: Any, given: Any, is_first: Bool[Array, "time batch"], noise: Any) -> Any:
+def _scan(cell: Cell, weights: Any, start: Any, given: Any, is_first: Bool[Array, "time batch"], noise: Any) -> Any:
     """(outputs, saved) of every step."""
 
     def step(state, inputs):
@@ -70,7 +70,7 @@ def _reset(state: Any, is_first: Bool[Array, " batch"]) -> Any:
 
 
 def _unroll_forward(cell, weights, start, given, is_first, noise):
-    output, saved = scan(cell, weights, start, given, is_first, noise)
+    output, saved = _scan(cell, weights, start, given, is_first, noise)
     return output, (weights, start, is_first, Memory(output, saved, noise))
 
 

@@ -74,6 +74,12 @@ def _difference(policy: Any, runtime: Any, content: bytes, environment: Any) -> 
     options = runtime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     session = runtime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    with contextlib.closing(environment):
+        return _largest(policy, session, environment)
+
+
+def _largest(policy: Any, session: Any, environment: Any) -> float:
+    """The same, with the session of the model."""
     names = [each.name for each in session.get_inputs()]
     obs, _ = environment.reset(seed=0)
     reward, state, largest = 0.0, policy.initial_state(1), 0.0
@@ -89,7 +95,6 @@ def _difference(policy: Any, runtime: Any, content: bytes, environment: Any) -> 
         obs, reward, terminated, truncated, _ = environment.step(action)
         if terminated or truncated:
             break
-    environment.close()
     return largest
 
 

@@ -102,6 +102,6 @@ def _is_of_training(folder: pathlib.Path) -> bool:
 def free_folder(name: str, parent: str = "runs") -> pathlib.Path:
     """The first of runs/NAME-1, runs/NAME-2, ... that does not exist; special characters become dashes."""
     number, name = 1, re.sub(r"[^\w.-]+", "-", name)
-    while (folder := pathlib.Path(parent) / f"{name}-{number}").exists():
+    while os.path.exists(folder := pathlib.Path(parent) / f"{name}-{number}"):  # noqa: PTH110 - as in `train`
         number += 1
     return folder

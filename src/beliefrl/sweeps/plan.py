@@ -43,7 +43,7 @@ class Experiment:
     (`beliefrl.Faults`) such as noise."""
     seeds: Sequence[int] = (0, 1, 2, 3, 4)
     """The seed numbers; the paper uses 5 seeds (Appendix B)."""
-    observe: Sequence[int | str] | int | str = ()
+    observe: Sequence[int | str] | int | str | None = None
     """Entries of the observation that the agent sees, as in `make_task`; empty: all."""
     constants: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """The task's constants, as in `make_task`."""
@@ -91,9 +91,13 @@ class Training:
         folder = sweep / self.name
         if not (folder / "results.json").exists():
             return False
-        run, options = Run(folder), Options(**_typed(self.options, Options))
-        has_all_steps = ((run.results() or {}).get("step") or 0) >= self.steps
-        return has_all_steps or run.reached(options.stop_at, options.stop_patience)
+        options = Options(**_typed(self.options, Options))
+        try:
+            run = Run(folder)
+            has_all_steps = ((run.results() or {}).get("step") or 0) >= self.steps
+            return has_all_steps or run.reached(options.stop_at, options.stop_patience)
+        except UserError:
+            return False  # it is damaged, and the training says so
 
 
 def grid(
@@ -109,7 +113,7 @@ def grid(
 
     Args:
         agents, tasks: names.
-        settings: the values to try, for each hyperparameter, training option or fault of the sensors.
+        settings: the values to try, for each hyperparameter or fault of the sensors.
         seeds: the number of seeds, counted from 0, or a list of seed numbers.
         fixed: settings with one value.
 
@@ -157,7 +161,7 @@ def plan(experiments: Iterable[Experiment], seeds_per_run: int | None = None) ->
             training = _training(experiment, first, count)
             if planned.setdefault(training.name, training) != training:
                 raise UserError(
-                    f"Two trainings would be called {training.name}: only hyperparameters can have several values."
+                    f"Two trainings would be called {training.name}: an option of the training can have only one value."
                 )
             order[training.name] = index
     _check(planned.values())
@@ -216,7 +220,8 @@ def _training(experiment: Experiment, first: int, count: int) -> Training:
     settings, options, faults = _split(experiment.settings)
     named = [*settings.items(), *experiment.constants.items(), *faults.items()]
     changed = [f"{name}={_as_text(value)}" for name, value in named]
-    observe = (experiment.observe,) if isinstance(experiment.observe, int | str) else tuple(experiment.observe)
+    given = () if experiment.observe is None else experiment.observe
+    observe = (given,) if isinstance(given, int | str) else tuple(given)
     seen = [f"observe={_as_text(observe)}"] if observe else []
     seeds = f"seed{first}" + (f"to{first + count - 1}" if count > 1 else "")
     name = re.sub(r"[^\w.=,-]+", "-", "-".join([experiment.agent, experiment.task, *changed, *seen]))

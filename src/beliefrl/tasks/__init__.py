@@ -20,7 +20,7 @@ from beliefrl.tasks.observed import Observed
 from beliefrl.tasks.observed import entries as entries
 from beliefrl.tasks.observed import entry_names as entry_names
 from beliefrl.tasks.observed import full as full
-from beliefrl.tasks.variants import observe, steps_per_action, with_action_repeat, with_faults
+from beliefrl.tasks.variants import as_task, observe, steps_per_action, with_action_repeat, with_faults
 from beliefrl.types import Spec, UserError, said, tuples
 
 
@@ -84,6 +84,15 @@ def masks(task: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
     if isinstance(task, Known):
         return task.velocities, task.positions
     return tuple(getattr(task, "VELOCITIES", ())), tuple(getattr(task, "POSITIONS", ()))
+
+
+def given(task: Any) -> Any:
+    """The task itself, the one with this name, or one that makes environments of this Gymnasium class.
+
+    Raises:
+        UserError: there is no such name, or it is an environment, another class, or no task at all.
+    """
+    return make(task) if isinstance(task, str) else as_task(task)
 
 
 def make(

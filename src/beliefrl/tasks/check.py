@@ -13,33 +13,14 @@ from rich.table import Table
 from rich.text import Text
 
 from beliefrl import tasks
+from beliefrl.tasks.check_warnings import Entry, about_episodes, about_observations, number
 from beliefrl.tasks.environment import TaskEnvironment
-from beliefrl.tasks.given import given
 from beliefrl.tasks.gymnasium import GymnasiumTask
-from beliefrl.tasks.seen_environment import ENDLESS
+from beliefrl.tasks.settings import settings_kept
 from beliefrl.tasks.spaces import action_names, check_actions, check_names, flat_bounds, flat_size, observation_names
 from beliefrl.types import LARGEST, UserError, check_whole, short
 
-SCALES = 100.0  # entries whose largest magnitudes differ by more than this factor cause a warning
 MOST_ROWS = 100  # of a printed table
-MOST_NAMED = 5  # entries in one warning
-
-
-@dataclasses.dataclass(frozen=True)
-class Entry:
-    """One entry of an observation or of an action."""
-
-    index: int
-    name: str
-    """Name with a unit in brackets; "entry 2" or "" if the environment has none."""
-    low: float
-    high: float
-    """Declared range; infinite if none is declared."""
-    seen_low: float = np.nan
-    seen_high: float = np.nan
-    """Range in the random steps; NaN for actions."""
-    position: int | None = None
-    """Index in the agent's observation; None if the agent does not observe it."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -117,7 +98,12 @@ def check(
     """
     check_whole("steps", steps, 1)
     check_whole("seed", seed, 0, LARGEST // 2)  # each episode has one more
-    whole = tasks.make(task, **constants) if isinstance(task, str) else given(task)
+    with settings_kept():
+        return _checked(task, observe, steps, seed, constants)
+
+
+def _checked(task: Any, observe: Any, steps: int, seed: int, constants: dict[str, Any]) -> TaskCheck:
+    whole = tasks.make(task, **constants) if isinstance(task, str) else tasks.given(task)
     found = _declared(whole)
     if found.refusals:
         return found
@@ -204,7 +190,7 @@ def _played(found: TaskCheck, task: Any, steps: int, seed: int) -> TaskCheck:
         refusals=tuple(refusals),
     )
     truncates = any(truncated for _, truncated in ends)
-    warnings = *_about_observations(entries, values), *_about_episodes(found, rewards, truncates)
+    warnings = *about_observations(entries, values), *about_episodes(found.max_steps, rewards, truncates)
     return dataclasses.replace(found, warnings=warnings)
 
 
@@ -220,66 +206,10 @@ def _with_values(entries: Sequence[Entry], values: Any, seen: Sequence[int]) -> 
     return tuple(rows)
 
 
-def _about_observations(entries: Sequence[Entry], values: Any) -> list[str]:
-    """Warnings about entries with the values (time, entry)."""
-    sentences = []
-    broken = [entry for entry in entries if not np.isfinite(values[:, entry.index]).all()]
-    if broken:
-        sentences.append(f"{_listed(broken)} had values that are not finite: an agent that observes them diverges.")
-    outside = [e for e in entries if _beyond(e.low - e.seen_low, e.low) or _beyond(e.seen_high - e.high, e.high)]
-    if outside:
-        sentences.append(f"{_listed(outside)} left the declared range: correct the observation or its space.")
-    seen = [entry for entry in entries if entry.position is not None]
-    constant = [entry for entry in seen if entry.seen_low == entry.seen_high]
-    if constant and len(values) > 1:
-        sentences.append(f"{_listed(constant)} never changed: leave out what says nothing, with --observe.")
-    sizes = sorted((max(-entry.seen_low, entry.seen_high), entry.index) for entry in seen if entry not in constant)
-    if sizes and sizes[-1][0] > SCALES * sizes[0][0]:
-        small, large = (f"{_listed([entries[i]])} up to {_number(size)}" for size, i in (sizes[0], sizes[-1]))
-        sentences.append(
-            f"Scales differ: {small}, {large}. Scale them in the environment, or use predictive-sac, which "
-            "standardises observations."
-        )
-    return sentences
-
-
-def _beyond(excess: float, bound: float) -> bool:
-    """Whether a value exceeds a bound by more than rounding."""
-    return excess > 1e-5 * max(1.0, abs(bound))
-
-
-def _about_episodes(found: TaskCheck, rewards: Sequence[float], truncates: bool) -> list[str]:
-    """Warnings about rewards and the end of episodes."""
-    sentences = []
-    if rewards and not any(rewards):
-        sentences.append("The reward was always 0: an agent that never meets another reward cannot learn.")
-    if found.max_steps is None and not truncates:
-        sentences.append(
-            f"There is no time limit: an episode of more than {ENDLESS:,} steps stops the training; set one with "
-            "--constants max_episode_steps=500, or in Python with GymnasiumTask(..., max_steps=500)."
-        )
-    return sentences
-
-
-def _listed(entries: Sequence[Entry]) -> str:
-    """Entries in a sentence: "Entry 2 (θ̇ in rad/s)"."""
-    names = [
-        str(entry.index) if entry.name == f"entry {entry.index}" else f"{entry.index}, {entry.name},"
-        for entry in entries[:MOST_NAMED]
-    ]
-    more = len(entries) - len(names)
-    text = " and ".join([*names, *([f"{more} more"] if more else [])])
-    return f"{'Entry' if len(entries) == 1 else 'Entries'} {text}"
-
-
-def _number(value: float) -> str:
-    return f"{value:.4g}"
-
-
 def _range(low: float, high: float) -> str:
     if np.isnan(low) or low == high:
-        return "none" if np.isnan(low) else f"always {_number(low)}"
-    return "unbounded" if np.isinf([low, high]).all() else f"{_number(low)} to {_number(high)}"
+        return "none" if np.isnan(low) else f"always {number(low)}"
+    return "unbounded" if np.isinf([low, high]).all() else f"{number(low)} to {number(high)}"
 
 
 def _table(title: str, entries: Sequence[Entry], seen: bool) -> Table:

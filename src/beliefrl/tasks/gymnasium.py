@@ -6,19 +6,18 @@ episodes follow the same rules as those of `rollout` (`seen_environment`).
 
 import contextlib
 import dataclasses
-import os
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any
 
 import gymnasium
-import jax
 
 from beliefrl.catalogue import our_task_names
 from beliefrl.tasks.faults import NONE, Faults
 from beliefrl.tasks.interface import Interface, check_measures, interface_of
 from beliefrl.tasks.repeat import LONGEST
 from beliefrl.tasks.seen_environment import Environment, FaultyEnvironment
+from beliefrl.tasks.settings import settings_kept
 from beliefrl.types import LARGEST, Spec, UserError, check_range, said, short
 
 
@@ -60,11 +59,7 @@ class GymnasiumTask:
 
     @cached_property
     def _seen(self) -> tuple[Spec, Interface]:
-        wide = jax.config.read("jax_enable_x64")
-        with contextlib.chdir(os.curdir):  # an environment may change both
-            environment = self.environment()
-        jax.config.update("jax_enable_x64", wide)
-        with contextlib.closing(environment):
+        with settings_kept(), contextlib.closing(self.environment()) as environment:
             interface = interface_of(environment, self.name)
         size = self.faults.observed_size(environment.indices.size)
         return Spec(size, len(interface.low), environment.limit or LARGEST, self.measures), interface

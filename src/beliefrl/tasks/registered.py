@@ -17,12 +17,12 @@ from collections.abc import Iterator
 from typing import Any
 
 import gymnasium
-import jax
 from gymnasium import error
 
 from beliefrl.catalogue import BULLET, KNOWN, PREFIX
 from beliefrl.errors import UserError, one_line, said
 from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.tasks.settings import settings_kept
 from beliefrl.types import check_whole
 
 
@@ -64,11 +64,9 @@ def make(id: str, arguments: dict[str, Any], name: str | None = None) -> Gymnasi
 
 
 def _import(package: str, id: str) -> None:
-    wide = jax.config.read("jax_enable_x64")
     try:
-        with _quiet(package):
+        with settings_kept(), _quiet(package):
             importlib.import_module(package)
-        jax.config.update("jax_enable_x64", wide)  # it would change the training
     except ModuleNotFoundError as found:
         raise UserError(_missing(id, found)) from None
     except (Exception, SystemExit) as found:  # a module may raise anything

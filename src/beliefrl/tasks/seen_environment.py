@@ -32,6 +32,14 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         self.inner = task.bare()
         self.inner_action_space: Any = getattr(self.inner, "action_space", None)
         self.inner_observation_space: Any = getattr(self.inner, "observation_space", None)
+        try:
+            self._prepare(task)
+        except BaseException:
+            self.close()
+            raise
+
+    def _prepare(self, task: Any) -> None:
+        """Check the spaces; set which entries are observed, and the time limit."""
         check_actions(self.inner_action_space, task.name)
         self._size = flat_size(self.inner_observation_space, task.name)
         if task.indices is not None:
@@ -171,7 +179,11 @@ class FaultyEnvironment(Environment):
     def __init__(self, task: Any, seed: str = ""):
         """Make the environment, and check that the noise fits its observation."""
         super().__init__(task, seed)
-        self._faults, self._random = task.faults, np.random.default_rng()
+        self._random = np.random.default_rng()
+
+    def _prepare(self, task: Any) -> None:
+        super()._prepare(task)
+        self._faults = task.faults
         size = task.faults.observed_size(self.indices.size)
         self.observation_space = spaces.Box(-np.inf, np.inf, (size,), np.float32)
 

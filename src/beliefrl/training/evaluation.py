@@ -17,7 +17,6 @@ from beliefrl.runs.records import finite_mean, finite_or_none
 from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.faults import Faults
-from beliefrl.tasks.given import given
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.interface import Interface
 from beliefrl.training.checks import about_task
@@ -185,7 +184,7 @@ def task_of(run: Run | str | os.PathLike[str], task: Task | GymnasiumTask | type
     """
     run = run if isinstance(run, Run) else Run(run)
     if task is not None:
-        made = given(task)
+        made = tasks.given(task)
         asked, there = map(about_task, (tasks.describe(made), run.config))
         if asked["observe"] != there["observe"]:
             raise UserError(

@@ -71,7 +71,7 @@ class Evaluation:
         ended: Callable[[int], None],
     ) -> Episode:
         """Episodes in every lane of every seed; leaves (seed, lane, episodes). `explore` says which are sampled."""
-        obs = environments.reset(environment_seeds(keys).reshape(-1))
+        obs = environments.reset(environment_seeds(keys))
         lanes = len(obs)
         action: Any = np.zeros((lanes, self.task.spec.action_dim), np.float32)
         never: Any = np.zeros(lanes, bool)
@@ -112,9 +112,8 @@ def _perceive(
     explore: Bool[Array, ""],
     time: Int[Array, ""],
 ) -> tuple[Float[Array, " action"], Any]:
-    empty = agent.reset(spec)
-    memory = jax.tree.map(lambda new, old: jnp.where(step.is_first, new, old), empty, memory)
-    return agent.act(state, memory, step, jax.random.fold_in(key, time), explore)
+    before = rollout.select(step.is_first, agent.reset(spec), memory)
+    return agent.act(state, before, step, jax.random.fold_in(key, time), explore)
 
 
 class _Record:

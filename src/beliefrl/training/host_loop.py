@@ -152,7 +152,7 @@ class HostLoop:
         """Begin an episode in every environment; returns the observations, (*lanes, obs)."""
         if self.envs > 1:
             keys = jax.vmap(lambda key: jax.random.split(key, self.envs))(keys)
-        obs = self.environments.reset(environment_seeds(keys).reshape(-1))
+        obs = self.environments.reset(environment_seeds(keys))
         return obs.reshape(*keys.shape, -1)
 
     def revive(self, seeds: SeedState, step: int) -> SeedState:

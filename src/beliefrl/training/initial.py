@@ -22,7 +22,15 @@ from beliefrl.training.phases import SeedState
 from beliefrl.types import Spec, UserError, plain
 
 FILE = "initial.safetensors"
-MEANING = {"normalise_critics": False, "critic_likelihood": False, "reward_memory": (), "observation_memory": ()}
+MEANING = {
+    "normalise_critics": False,
+    "critic_likelihood": False,
+    "reward_memory": (),
+    "observation_memory": (),
+    "deterministic": False,
+    "perceive_action": False,
+    "perceive_reward": False,
+}
 """Hyperparameters that change what the arrays mean, and their value in an agent without them. For those with False it
 matters only whether they are on."""
 
@@ -39,8 +47,8 @@ def taken(options: Options, agent: Agent, spec: Spec) -> tuple[dict[str, np.ndar
     Seed n starts from seed n of the other run. If the other run has fewer seeds, its seeds are reused in a cycle.
 
     Raises:
-        UserError: there is no such run, it has no trained agent, or the agents differ in an array, in whether layers
-            are normalised, or in the time constants of a memory.
+        UserError: there is no such run, it has no trained agent, its agent was not pre-trained, or the agents differ in
+            an array or in a setting of MEANING.
     """
     source = Run(options.init_from or "")
     path = source.agents(options.init_best)
@@ -53,6 +61,7 @@ def taken(options: Options, agent: Agent, spec: Spec) -> tuple[dict[str, np.ndar
     _refuse_other_settings(source, agent)
     seeds, index = range(options.seed, options.seed + options.seeds), seeds_there(options)
     ends = best.evaluations(source.folder, len(source.seeds)) if options.init_best else _last_steps(source)
+    _refuse_untrained(source, agent, [ends[at] for at in index])
     session = [source.config, *source.config.get("resumed", ())][-1]
     origin = {
         "run": str(source.folder),
@@ -106,6 +115,19 @@ def _last_steps(source: Run) -> list[dict[str, Any] | None]:
         diverged = any(source.rows(seed, "diverged"))
         steps.append(int(saved) if saved.isdecimal() and not diverged else evaluated)
     return [None if step is None else {"step": step} for step in steps]
+
+
+def _refuse_untrained(source: Run, agent: Agent, ends: list[dict[str, Any] | None]) -> None:
+    """Refuse agents that were saved before their pre-training: a training with init_from has none."""
+    explored = source.config["hyperparameters"].get("step_start_rl", 0)
+    if not agent.pretrain_updates or "initial" in source.config:
+        return
+    for end in ends:
+        if end is not None and end["step"] <= explored:
+            raise UserError(
+                f"{source.folder} cannot be init_from: its agent was saved at step {end['step']:,}, before the "
+                "pre-training; train it for more steps."
+            )
 
 
 def _refuse_other_settings(source: Run, agent: Agent) -> None:

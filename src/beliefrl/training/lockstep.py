@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from beliefrl.errors import Fault
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.seen_environment import Environment
+from beliefrl.tasks.settings import settings_kept
 from beliefrl.training.stop import SIGNALS
 from beliefrl.types import UserError
 
@@ -100,10 +101,8 @@ class Lockstep:
     def _processes(self, factories: list["_Factory"]) -> AsyncVectorEnv:
         # Forking a process in which JAX runs threads may never return. A daemon could not start processes of its own.
         settings: dict[str, Any] = {"context": "spawn", "daemon": False, "autoreset_mode": AutoresetMode.DISABLED}
-        try:
+        with settings_kept():  # an environment is made here too, to see its spaces
             envs = AsyncVectorEnv(factories, **settings)
-        finally:  # an environment was made here too, to see its spaces
-            jax.config.update("jax_enable_x64", self._is_wide)
         atexit.register(self.close)  # at its exit Python would wait for processes that ignore SIGTERM
         return envs
 
@@ -155,6 +154,7 @@ class Lockstep:
             raise Fault(self._delay()) from None
         except Exception:  # the call has returned, with an error of an environment
             self._call = None
+            jax.config.update("jax_enable_x64", self._is_wide)
             raise
         self._call = None
         if jax.config.read("jax_enable_x64") != self._is_wide:
@@ -255,9 +255,8 @@ def _pays(task: GymnasiumTask, lanes: int) -> bool:
 
 def step_seconds(task: GymnasiumTask) -> float:
     """The median time of 20 steps with random actions; 0 if it cannot be measured."""
-    wide = jax.config.read("jax_enable_x64")
     try:
-        with contextlib.closing(task.environment()) as environment:
+        with settings_kept(), contextlib.closing(task.environment()) as environment:
             environment.reset(seed=0)
             actions = np.random.default_rng(0).uniform(-1, 1, (20, task.spec.action_dim))
             times = []
@@ -269,13 +268,9 @@ def step_seconds(task: GymnasiumTask) -> float:
                     environment.reset()
     except UserError:
         return 0.0
-    finally:
-        jax.config.update("jax_enable_x64", wide)  # an environment may change it
     return float(np.median(times))
 
 
-def environment_seeds(keys: Key[Array, "*lane"]) -> Int[np.ndarray, "*lane"]:
+def environment_seeds(keys: Key[Array, "*axes"]) -> Int[np.ndarray, " lane"]:
     """A seed for the environment of each key."""
-    return np.asarray(jax.vmap(lambda key: jax.random.randint(key, (), 0, 2**31 - 1))(keys.reshape(-1))).reshape(
-        keys.shape
-    )
+    return np.asarray(jax.vmap(lambda key: jax.random.randint(key, (), 0, 2**31 - 1))(keys.reshape(-1)))

@@ -117,7 +117,7 @@ def _act(
     return seed._replace(actor=actor, replay=replay), _write(log, index, episode)
 
 
-def _sum_metrics(shapes: Any) -> Metrics:
+def _zeros(shapes: Any) -> Metrics:
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
 
@@ -139,7 +139,7 @@ def pretrain(
         seeds, metrics = update(seeds, first + i)
         return seeds, jax.tree.map(jnp.add, totals, metrics)
 
-    totals = _sum_metrics(jax.eval_shape(update, seeds, first)[1])
+    totals = _zeros(jax.eval_shape(update, seeds, first)[1])
     seeds, totals = jax.lax.fori_loop(0, updates, step, (seeds, totals))
     return seeds, jax.tree.map(lambda total: total / jnp.maximum(updates, 1), totals)
 
@@ -168,7 +168,7 @@ def learn(
         seeds, log, metrics = one_round(seeds, log, first + i * length, i * length)
         return seeds, log, jax.tree.map(jnp.add, totals, metrics)
 
-    seeds, log, totals = jax.lax.fori_loop(0, rounds, step, (seeds, none, _sum_metrics(shapes)))
+    seeds, log, totals = jax.lax.fori_loop(0, rounds, step, (seeds, none, _zeros(shapes)))
     return seeds, Stretch(jax.tree.map(lambda total: total / jnp.maximum(rounds, 1), totals), log)
 
 

@@ -84,6 +84,10 @@ def read(
     from which two windows are stored if a ring has so many. It must jump if its next window is not complete, or was
     overwritten. So the oldest and the newest timesteps of a ring are read less often than the others.
 
+    Nothing is learned from the first window after a jump until an episode begins in it. So a jump into the first
+    window of a ring goes to its oldest timestep, if an episode begins there. If a ring has at most three windows,
+    a reader also reads the rest after its last complete one.
+
     Raises:
         UserError: there are fewer readers than windows to read.
     """
@@ -93,10 +97,14 @@ def read(
     key_place, key_jump = jax.random.split(key)
     number, of_ring = readers.number[reader], readers.ring[reader]
     oldest, added = span(replay, of_ring)
-    stored = (number >= oldest) & (number + shape.length < added)
+    needed = jnp.where(added - oldest <= 3 * shape.length, 1, shape.length)  # transitions from the reader's place on
+    stored = (number >= oldest) & (number + needed < added)
     continues = stored & ~jax.random.bernoulli(key_jump, shape.jump, (batch,))
-    place = places(replay, key_place, batch, 2 * shape.length)
-    number, of_ring = (jnp.where(continues, *pair) for pair in zip((number, of_ring), place, strict=True))
+    place, ring = places(replay, key_place, batch, 2 * shape.length)
+    first, _ = span(replay, ring)
+    begins = gather(replay, first[None], ring[None]).step.is_first[0]
+    place = jnp.where(begins & (place < first + shape.length), first, place)
+    number, of_ring = jnp.where(continues, number, place), jnp.where(continues, of_ring, ring)
     numbers = number[None] + jnp.arange(shape.length + 1)[:, None]
     timesteps, exists = gather(replay, numbers, of_ring[None]), numbers < span(replay, of_ring)[1][None]
     after = Readers(

@@ -75,6 +75,11 @@ def strong(tree: Any) -> Any:
     return jax.tree.map(cast, tree)
 
 
+def select(condition: Bool[Array, "..."], new: Any, old: Any) -> Any:
+    """The tree `new` where the condition is true, and `old` elsewhere."""
+    return jax.tree.map(lambda new, old: jnp.where(condition, new, old), new, old)
+
+
 def first(agent: Agent, spec: Spec, task_state: Any, obs: Float[Array, " obs"]) -> ActorState:
     """The first timestep of an episode: no reward, no action before it, an empty memory."""
     step = Timestep(
@@ -146,7 +151,7 @@ def record(
     # Only the note is used. If it does not depend on the action, XLA removes the acting.
     _, last = agent.act(state, after.memory, after.step, key, jnp.array(True))
     replay = ring.add(replay, StoredTimestep(after.step, agent.note(last)), done)
-    return jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, after), replay
+    return select(done, fresh, after), replay
 
 
 def advance(
@@ -171,13 +176,13 @@ def refresh(
 
     def perceive(memory, inputs):
         step, exists, key = inputs
-        before = jax.tree.map(lambda new, old: jnp.where(step.is_first, new, old), empty, memory)
+        before = select(step.is_first, empty, memory)
         _, after = agent.act(state, before, step, key, jnp.array(True))
-        memory = jax.tree.map(lambda new, old: jnp.where(exists, new, old), after, memory)
+        memory = select(exists, after, memory)
         return memory, agent.note(memory)
 
     memory, notes = jax.lax.scan(perceive, empty, (steps, exists, jax.random.split(key, length)))
-    memory = jax.tree.map(lambda old, new: jnp.where(actor.step.is_first, old, new), empty, memory)
+    memory = select(actor.step.is_first, empty, memory)
     return strong(actor._replace(memory=memory)), ring.annotate(replay, notes, length)
 
 
@@ -197,7 +202,7 @@ def evaluate(agent: Agent, task: Task, state: Any, key: Key[Array, ""], explore:
         actors, now = jax.vmap(lambda actor, key, explore: move(agent, task, state, actor, key, explore))(
             actors, keys, explore
         )
-        result = jax.tree.map(lambda old, new: jnp.where(result.done, old, new), result, now)
+        result = select(result.done, result, now)
         return time + 1, actors, result
 
     def unfinished(carry):

@@ -148,63 +148,88 @@ def stages(
 def _stages(
     agent: Agent, program: Program, options: Options, at: TrainingProgress, seeds: SeedState
 ) -> Iterator[Event]:
-    envs, length = options.envs, round_length(agent, options.envs)
-    explored = min(agent.step_start_rl, options.steps)
-    stretch = stretch_length(agent, envs)
-
-    if at.evaluated // options.eval_every < at.step // options.eval_every:  # a fault came before the end of this one
-        yield from _evaluation(agent, program, seeds, at.step, Phase.LEARNING)
-        at = at._replace(evaluated=at.step)
-        yield Event(Phase.LEARNING, at.step, snapshot=Snapshot(at, seeds))
-    if at.step < explored:
-        yield Event(Phase.COMPILING_EXPLORATION, at.step)
-        seeds, _ = program.explore(seeds, at.step, 0)
-        yield Event(Phase.EXPLORING, at.step)
-    while at.step < explored:
-        until = min(stretch, explored - at.step, _until(at.step, options.eval_every))
-        steps = -(-until // envs) * envs
-        seeds, log = program.explore(seeds, at.step, steps)
-        before, at = at.step, at._replace(step=at.step + steps)
-        yield Event(Phase.EXPLORING, at.step, episodes=log.episodes)
-        if at.step // options.eval_every > before // options.eval_every:
-            yield from _evaluation(agent, program, seeds, at.step, Phase.EXPLORING)
-            at = at._replace(evaluated=at.step)
-        yield Event(Phase.EXPLORING, at.step, snapshot=Snapshot(at, seeds))
-
+    if _is_due(options, at):  # a fault came before the end of this evaluation
+        at = yield from _evaluate(agent, program, options, at, seeds, Phase.LEARNING)
+    if at.step < min(agent.step_start_rl, options.steps):
+        at, seeds = yield from _explore(agent, program, options, at, seeds)
     if at.step < options.steps and agent.pretrain_updates and not at.refreshed:
-        if at.pretrained < agent.pretrain_updates:
-            yield Event(Phase.COMPILING_PRETRAINING, at.step)
-            seeds, _ = program.pretrain(seeds, at.pretrained, 0)
-            yield Event(Phase.PRETRAINING, at.step)
-        while at.pretrained < agent.pretrain_updates:
-            updates = min(stretch, agent.pretrain_updates - at.pretrained)
-            seeds, metrics = program.pretrain(seeds, at.pretrained, updates)
-            at = at._replace(pretrained=at.pretrained + updates)
-            means = {f"pretrain_{name}": mean for name, mean in metrics.items()}
-            part = at.pretrained, agent.pretrain_updates
-            yield Event(Phase.PRETRAINING, at.step, means, part=part, snapshot=Snapshot(at, seeds))
-        seeds, at = program.refresh(seeds), at._replace(refreshed=True)
-        yield Event(Phase.PRETRAINING, at.step, snapshot=Snapshot(at, seeds))
-
+        at, seeds = yield from _pretrain(agent, program, options, at, seeds)
     if at.step < options.steps:
-        yield Event(Phase.COMPILING_LEARNING, at.step)
-        seeds, _ = program.learn(seeds, at.step, 0)
-        yield Event(Phase.LEARNING, at.step)
-    while at.step < options.steps:
-        until = min(options.steps - at.step, _until(at.step, options.eval_every))
-        rounds = min(-(-until // length), stretch // length)
-        seeds, log = program.learn(seeds, at.step, rounds)
-        before, at = at.step, at._replace(step=at.step + rounds * length)
-        yield Event(Phase.LEARNING, at.step, log.metrics, log.episodes)
-        if at.step // options.eval_every > before // options.eval_every:
-            yield from _evaluation(agent, program, seeds, at.step, Phase.LEARNING)
-            at = at._replace(evaluated=at.step)
-        yield Event(Phase.LEARNING, at.step, snapshot=Snapshot(at, seeds))
+        at, seeds = yield from _learn(agent, program, options, at, seeds)
     last = None
     if at.evaluated < at.step:
         yield from _evaluation(agent, program, seeds, at.step, Phase.LEARNING)
         last = Snapshot(at._replace(evaluated=at.step), seeds)
     yield Event(Phase.FINISHED, at.step, snapshot=last)
+
+
+Stage = Generator[Event, None, Snapshot]  # returns the training at its end
+
+
+def _explore(agent: Agent, program: Program, options: Options, at: TrainingProgress, seeds: SeedState) -> Stage:
+    """Steps with the untrained policy."""
+    yield Event(Phase.COMPILING_EXPLORATION, at.step)
+    seeds, _ = program.explore(seeds, at.step, 0)
+    yield Event(Phase.EXPLORING, at.step)
+    explored, stretch = min(agent.step_start_rl, options.steps), stretch_length(agent, options.envs)
+    while at.step < explored:
+        until = min(stretch, explored - at.step, _until(at.step, options.eval_every))
+        steps = -(-until // options.envs) * options.envs
+        seeds, log = program.explore(seeds, at.step, steps)
+        at = at._replace(step=at.step + steps)
+        yield Event(Phase.EXPLORING, at.step, episodes=log.episodes)
+        at = yield from _evaluate(agent, program, options, at, seeds, Phase.EXPLORING)
+    return Snapshot(at, seeds)
+
+
+def _pretrain(agent: Agent, program: Program, options: Options, at: TrainingProgress, seeds: SeedState) -> Stage:
+    """Updates without steps; then the replay is perceived again."""
+    if at.pretrained < agent.pretrain_updates:
+        yield Event(Phase.COMPILING_PRETRAINING, at.step)
+        seeds, _ = program.pretrain(seeds, at.pretrained, 0)
+        yield Event(Phase.PRETRAINING, at.step)
+    while at.pretrained < agent.pretrain_updates:
+        updates = min(stretch_length(agent, options.envs), agent.pretrain_updates - at.pretrained)
+        seeds, metrics = program.pretrain(seeds, at.pretrained, updates)
+        at = at._replace(pretrained=at.pretrained + updates)
+        means = {f"pretrain_{name}": mean for name, mean in metrics.items()}
+        part = at.pretrained, agent.pretrain_updates
+        yield Event(Phase.PRETRAINING, at.step, means, part=part, snapshot=Snapshot(at, seeds))
+    seeds, at = program.refresh(seeds), at._replace(refreshed=True)
+    yield Event(Phase.PRETRAINING, at.step, snapshot=Snapshot(at, seeds))
+    return Snapshot(at, seeds)
+
+
+def _learn(agent: Agent, program: Program, options: Options, at: TrainingProgress, seeds: SeedState) -> Stage:
+    """Rounds of steps and updates."""
+    yield Event(Phase.COMPILING_LEARNING, at.step)
+    seeds, _ = program.learn(seeds, at.step, 0)
+    yield Event(Phase.LEARNING, at.step)
+    length, stretch = round_length(agent, options.envs), stretch_length(agent, options.envs)
+    while at.step < options.steps:
+        until = min(options.steps - at.step, _until(at.step, options.eval_every))
+        rounds = min(-(-until // length), stretch // length)
+        seeds, log = program.learn(seeds, at.step, rounds)
+        at = at._replace(step=at.step + rounds * length)
+        yield Event(Phase.LEARNING, at.step, log.metrics, log.episodes)
+        at = yield from _evaluate(agent, program, options, at, seeds, Phase.LEARNING)
+    return Snapshot(at, seeds)
+
+
+def _evaluate(
+    agent: Agent, program: Program, options: Options, at: TrainingProgress, seeds: SeedState, then: Phase
+) -> Generator[Event, None, TrainingProgress]:
+    """Evaluate if an evaluation is due. Then the training can stop."""
+    if _is_due(options, at):
+        yield from _evaluation(agent, program, seeds, at.step, then)
+        at = at._replace(evaluated=at.step)
+    yield Event(then, at.step, snapshot=Snapshot(at, seeds))
+    return at
+
+
+def _is_due(options: Options, at: TrainingProgress) -> bool:
+    """Whether a multiple of `eval_every` has passed since the last evaluation."""
+    return at.evaluated // options.eval_every < at.step // options.eval_every
 
 
 ROOM = 1.25  # timesteps in the replay per step: with episodes of at least 4 steps it has the whole training

@@ -15,7 +15,6 @@ from beliefrl.runs.folder import free_folder, locked, write_config
 from beliefrl.runs.records import provenance
 from beliefrl.runs.run import Recorder, Run
 from beliefrl.tasks import Task
-from beliefrl.tasks.given import given
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import checks, initial, initial_replay
 from beliefrl.training.evaluation import agent_of, check_interface, task_of
@@ -70,7 +69,7 @@ def train(
         Stopped: Ctrl-C or SIGTERM, after a checkpoint is written; `resume` continues. It is a KeyboardInterrupt.
     """
     agent = agents.given(agent)
-    made: Any = given(task)
+    made: Any = tasks.given(task)
     chosen = _chosen(options)
     _ = capacity(agent, chosen), made.spec  # raise before the folder is made
     checks.possible(chosen, made, own_process)

@@ -96,7 +96,7 @@ def _window(fps: float) -> Iterator[Writer]:
     viewer = Viewer("BeliefRL")
 
     def add(pixels: Pixels) -> None:
-        viewer.show(pixels, round(fps))
+        viewer.show(pixels, fps)
         if viewer.is_closed:
             raise KeyboardInterrupt("the window was closed.")
 
