@@ -21,16 +21,15 @@ import numpy as np
 
 from beliefrl import agents, onnx
 from beliefrl.agents import Agent
-from beliefrl.analysis.figures import check_folder
 from beliefrl.policy_inputs import check_finite, each, flags, numbers
-from beliefrl.runs.arrays import write_whole
+from beliefrl.runs.given_files import check_folder, write_given
 from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.environment import TaskEnvironment
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.interface import Interface
 from beliefrl.training.evaluation import check_interface, restore_policy, task_of
-from beliefrl.types import LARGEST, Spec, Timestep, UserError, cause, check_whole
+from beliefrl.types import LARGEST, Spec, Timestep, UserError, check_whole
 
 State = tuple[np.ndarray, ...]
 
@@ -59,7 +58,7 @@ class Policy:
         self.environment, self.interface = environment, interface
         self._state = jax.device_put(state)
         self._empty = jax.device_get(agent.reset(spec))  # the memory at the start of an episode
-        self._act = jax.jit(lambda *inputs: self._step(self._state, *inputs))
+        self._act = jax.jit(self._step)
         self._calls = 0
         self._ignores_reward = False  # found when a reward is left out
 
@@ -69,19 +68,19 @@ class Policy:
         on = f" on {self.task}" if self.task else ""
         return f"<Policy {agents.name_of(self.agent)}{on}: {sizes}, seed {self.seed}>"
 
-    def _step(self, agent_state, obs, reward, state, episode_start, seed, deterministic):
+    def _step(self, obs, reward, state, episode_start, seed, deterministic):
         """Act for a batch. `state` holds the leaves of the memory and the previous action, each (batch, ...)."""
         key = jax.random.key(seed)
         keys = jax.vmap(lambda index: jax.random.fold_in(key, index))(jnp.arange(obs.shape[0]))
-        return self._act_with(agent_state, obs, reward, state, episode_start, keys, ~deterministic)
+        return self._act_with(obs, reward, state, episode_start, keys, ~deterministic)
 
     def mode(self, obs: Any, reward: Any, episode_start: Any, *state: Any) -> tuple[Any, ...]:
         """The mode action and the parts of the next state, as a pure JAX function of arrays (batch, ...)."""
         key, explore = jax.random.key(0), jnp.array(False)
-        action, after = self._act_with(self._state, obs, reward, state, episode_start, key, explore)
+        action, after = self._act_with(obs, reward, state, episode_start, key, explore)
         return action, *after
 
-    def _act_with(self, agent_state, obs, reward, state, episode_start, keys, explore):
+    def _act_with(self, obs, reward, state, episode_start, keys, explore):
         """The same with a random key for each episode, or one key for all of them."""
         *memory, prev_action = state
         memory = jax.tree.structure(self._empty).unflatten(memory)
@@ -93,7 +92,7 @@ class Policy:
             is_first=episode_start,
             terminated=jnp.zeros_like(episode_start),
         )
-        act = functools.partial(self.agent.act, agent_state)
+        act = functools.partial(self.agent.act, self._state)
         axes = 0, 0, 0 if keys.ndim else None, None
         with jax.default_matmul_precision(self.precision):
             action, memory = jax.vmap(act, in_axes=axes)(memory, step, keys, explore)
@@ -216,10 +215,7 @@ class Policy:
             content, difference = onnx.export(in_float32, self.environment)
         else:
             content, difference = self._for_jax(), None
-        try:
-            write_whole(path, content)
-        except OSError as error:
-            raise UserError(f"{path} cannot be written ({cause(error)}): choose another file.") from None
+        write_given(path, content)
         return difference
 
     def _for_jax(self) -> bytes:

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from beliefrl.analysis.groups import Group, task_of
-from beliefrl.runs.arrays import write_whole
+from beliefrl.runs.given_files import check_folder, write_given
 from beliefrl.runs.run import Run
-from beliefrl.types import UserError, cause
+from beliefrl.types import UserError
 
 COLOURS = {"sampled": "#1f6f8b", "mode": "#c8553d"}
 KINDS = (".png", ".pdf")
@@ -45,14 +45,6 @@ def paths(path: pathlib.Path) -> tuple[pathlib.Path, pathlib.Path]:
     return path.with_suffix(KINDS[0]), path.with_suffix(KINDS[1])
 
 
-def check_folder(path: pathlib.Path) -> None:
-    """Raise a UserError if the folder of `path` does not exist, or if `path` itself is a folder."""
-    if not os.path.isdir(path.parent):  # noqa: PTH112 - pathlib's version raises if a name is too long
-        raise UserError(f"{path} cannot be written (there is no folder {path.parent}): create it, or choose another.")
-    if os.path.isdir(path):  # noqa: PTH112
-        raise UserError(f"{path} cannot be written (it is a folder): choose another name.")
-
-
 def save(figure: Any, path: pathlib.Path) -> pathlib.Path:
     """Write a figure to both of its `paths`; returns the path of the PNG.
 
@@ -67,10 +59,7 @@ def save(figure: Any, path: pathlib.Path) -> pathlib.Path:
 def _write(figure: Any, path: pathlib.Path) -> None:
     content = io.BytesIO()
     figure.savefig(content, format=path.suffix[1:].lower(), dpi=150)
-    try:
-        write_whole(path, content.getvalue())
-    except OSError as error:
-        raise UserError(f"{path} cannot be written ({cause(error)}): choose another file.") from None
+    write_given(path, content.getvalue())
 
 
 def axis_label(measure: str) -> str:

@@ -57,7 +57,7 @@ class Group:
     @cached_property
     def diverged(self) -> np.ndarray:
         """Which seeds have diverged, (seed,)."""
-        return np.array([_diverged(run, seed) for run, seed in self.seeds])
+        return np.array([run.has_diverged(seed) for run, seed in self.seeds])
 
     @cached_property
     def stopped(self) -> np.ndarray:
@@ -164,7 +164,7 @@ def is_finished(run: Run) -> bool:
     """Whether every seed has been evaluated at the last step, or has diverged, or all have reached `stop_at`."""
     if _has_stopped(run):
         return True
-    return all(_diverged(run, seed) or last_step(run, seed) >= run.options.steps for seed in run.seeds)
+    return all(run.has_diverged(seed) or last_step(run, seed) >= run.options.steps for seed in run.seeds)
 
 
 def _has_stopped(run: Run) -> bool:
@@ -174,10 +174,6 @@ def _has_stopped(run: Run) -> bool:
 def last_step(run: Run, seed: int) -> int:
     """Environment steps of a seed at its last evaluation; 0 if there is none."""
     return max((row["step"] for row in run.rows(seed, "evaluation")), default=0)
-
-
-def _diverged(run: Run, seed: int) -> bool:
-    return any(run.rows(seed, "diverged"))
 
 
 def groups(

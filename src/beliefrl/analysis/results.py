@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from beliefrl.runs.arrays import write_whole
+from beliefrl.runs.given_files import write_given
 from beliefrl.runs.run import Row, Run
-from beliefrl.types import UserError, cause
+from beliefrl.types import UserError
 
 ENDING = ".json.gz"
 FORMAT = 1
@@ -100,10 +100,7 @@ def write(path: pathlib.Path, runs: Sequence[Run], defaults: Mapping[str, Row]) 
         "defaults": {agent: defaults[agent] for agent in used},
         "runs": [entries[name] for name in sorted(entries)],
     }
-    try:
-        write_whole(path, gzip.compress(json.dumps(content, separators=(",", ":")).encode(), mtime=0))
-    except OSError as error:
-        raise UserError(f"{path} cannot be written ({cause(error)}): choose another file.") from None
+    write_given(path, gzip.compress(json.dumps(content, separators=(",", ":")).encode(), mtime=0))
 
 
 def changed(hyperparameters: Row, defaults: Row) -> Row:

@@ -13,13 +13,14 @@ from typing import NamedTuple
 import numpy as np
 
 from beliefrl.analysis.aggregate import known_bounds
-from beliefrl.analysis.figures import check_folder, standard_error
+from beliefrl.analysis.figures import standard_error
 from beliefrl.analysis.groups import Curve, Group, last_step
 from beliefrl.analysis.panels import numbers
 from beliefrl.runs import arrays
-from beliefrl.runs.arrays import write_whole
+from beliefrl.runs.given_files import check_folder, write_given
+from beliefrl.runs.records import sessions
 from beliefrl.runs.run import Run
-from beliefrl.types import UserError, cause
+from beliefrl.types import UserError
 
 SOLVED = 0.95  # score (`aggregate`): a return of -203 on the pendulum, 951 on CartPole, 133 on target reaching
 TIMED_STEPS = 100_000  # as in the paper's table
@@ -72,11 +73,8 @@ def write_table(columns: Sequence[Column], rows: Sequence[Cells], out: pathlib.P
     if not rows:
         raise UserError("The table would be empty: none of these runs has an evaluation there.")
     check_folder(out)
-    try:
-        write_whole(out.with_suffix(".tex"), latex(columns, rows).encode())
-        write_whole(out.with_suffix(".md"), markdown(columns, rows).encode())
-    except OSError as error:
-        raise UserError(f"{out} cannot be written ({cause(error)}): choose another --out.") from None
+    write_given(out.with_suffix(".tex"), latex(columns, rows).encode())
+    write_given(out.with_suffix(".md"), markdown(columns, rows).encode())
     return out.with_suffix(".md")
 
 
@@ -166,7 +164,7 @@ class Cost(NamedTuple):
 def wall_clock(run: Run) -> float | None:
     """Total seconds of a run's sessions; None if a session was killed, so that its end is unknown."""
     total = 0.0
-    for session in (run.config, *run.config.get("resumed", ())):
+    for session in sessions(run.config):
         try:
             began, ended = (datetime.fromisoformat(session[name]) for name in ("started", "ended"))
             total += (ended - began).total_seconds()

@@ -59,13 +59,6 @@ def q_outputs(
     return jax.vmap(lambda s, a: critic.rest(s + a @ first.weight[:, size:].T + first.bias))(projected, action)
 
 
-def least(
-    critics: tuple[MLP, MLP], belief: Float[Array, "batch belief"], action: Float[Array, "batch action"]
-) -> Float[Array, " batch"]:
-    """min_i Q_i(s, a)."""
-    return jnp.minimum(*(q_value(critic, belief, action) for critic in critics))
-
-
 def state_value(value: MLP, belief: Float[Array, "batch belief"]) -> Float[Array, " batch"]:
     """V(s)."""
     return jax.vmap(value)(belief)[:, 0]
@@ -81,7 +74,8 @@ class Controller(NamedTuple):
     log_alpha: Float[Array, ""]
 
     def q(self, belief: Float[Array, "batch belief"], action: Float[Array, "batch action"]) -> Float[Array, " batch"]:
-        return least(self.critics, belief, action)
+        """min_i Q_i(s, a)."""
+        return jnp.minimum(*(q_value(critic, belief, action) for critic in self.critics))
 
 
 class Batch(NamedTuple):

@@ -20,8 +20,8 @@ from typing import Any
 
 from beliefrl.analysis.groups import find
 from beliefrl.report.data import CachedRun, page_data
-from beliefrl.runs.arrays import write_whole
-from beliefrl.types import UserError, cause
+from beliefrl.runs.given_files import check_folder, write_given
+from beliefrl.types import UserError
 
 
 def write_report(
@@ -48,17 +48,11 @@ def write_report(
         raise UserError(f"{out} must end in .html, such as report.html.")
     if not isinstance(paths, str | os.PathLike) and not paths:
         raise UserError("There are no runs: give folders of runs, folders that contain runs, or files of results.")
-    if not os.path.isdir(out.parent):  # noqa: PTH112 - pathlib's version raises if a name is too long
-        raise UserError(
-            f"There is no folder {out.parent} to write {out.name} into: create it, or choose another --out."
-        )
+    check_folder(out)
     found = find(paths, CachedRun)
     data = page_data(found.runs, out.parent, unfinished)
     content = page(data | {"damage": [*data.pop("without_curve"), *found.damage]})
-    try:
-        write_whole(out, content.encode())
-    except OSError as error:
-        raise UserError(f"{out} cannot be written ({cause(error)}): choose another --out.") from None
+    write_given(out, content.encode())
     if note is not None:
         for sentence in found.damage:
             note(sentence)

@@ -16,6 +16,7 @@ from beliefrl.analysis.groups import Curve, Group, groups, is_finished, last_ste
 from beliefrl.analysis.panels import colours, dashes
 from beliefrl.analysis.results import changed
 from beliefrl.analysis.tables import wall_clock
+from beliefrl.runs.records import sessions
 from beliefrl.runs.run import Row, Run
 from beliefrl.training.evaluation import MODES
 
@@ -129,7 +130,6 @@ def number(value: float) -> float | None:
 
 def _run(run: Run, page_folder: pathlib.Path, groups_of: Sequence[int | None]) -> dict[str, Any]:
     config = run.config
-    sessions = [config, *config.get("resumed", ())]
     steps = {seed: last_step(run, seed) for seed in run.seeds}
     return {
         "folder": str(run.folder),
@@ -143,7 +143,7 @@ def _run(run: Run, page_folder: pathlib.Path, groups_of: Sequence[int | None]) -
         "diverged": [f"seed {seed}: {row.get('why')}" for seed in run.seeds for row in run.rows(seed, "diverged")],
         "seconds": wall_clock(run),
         "settings": settings(config),
-        "sessions": [_session(session) for session in sessions],
+        "sessions": [_session(session) for session in sessions(config)],
         "config": json.dumps(config, indent=2),
         "media": [_link(page_folder, path) for path in _media(run.folder)],
     }

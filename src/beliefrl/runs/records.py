@@ -70,6 +70,11 @@ def steps_per_action(config: Row) -> int:
     return config["constants"].get("steps_per_action", 1)
 
 
+def sessions(config: Row) -> list[Row]:
+    """The records of a training's sessions (`provenance`), the first one with the rest of the config."""
+    return [config, *config.get("resumed", ())]
+
+
 def _is_session(session: Any) -> bool:
     """Whether the value can be a record of `provenance`."""
     if not isinstance(session, dict):

@@ -120,6 +120,10 @@ class Run:
     def _metrics(self, seed: int) -> pathlib.Path:
         return self.folder / "metrics" / f"seed-{seed}.jsonl"
 
+    def has_diverged(self, seed: int) -> bool:
+        """Whether a seed has diverged."""
+        return any(self.rows(seed, "diverged"))
+
     def results(self) -> Row | None:
         """The summary of the last evaluation before the training ended or was stopped; None before that.
 
@@ -144,7 +148,7 @@ class Run:
         """
         if line is None:
             return False
-        going = [seed for seed in self.seeds if not any(self.rows(seed, "diverged"))]
+        going = [seed for seed in self.seeds if not self.has_diverged(seed)]
         returns = [[fmean(row["sampled"]) for row in self.rows(seed, "evaluation")][-patience:] for seed in going]
         return bool(going) and all(len(last) == patience and min(last) >= line for last in returns)
 
@@ -221,8 +225,7 @@ class Recorder(Run):
 
     def note_end(self) -> None:
         """Record the time at which this session ends. A full disk is ignored."""
-        session = self.config["resumed"][-1] if self.config.get("resumed") else self.config
-        session["ended"] = now()
+        records.sessions(self.config)[-1]["ended"] = now()
         with contextlib.suppress(OSError):
             write_config(self.folder, self.config)
 

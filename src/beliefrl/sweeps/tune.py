@@ -240,7 +240,7 @@ class _Loop:
         if name in self.is_poor or not (self.folder / name / "config.json").exists():
             return
         run = Run(self.folder / name)
-        if _has_diverged(run):
+        if any(map(run.has_diverged, run.seeds)):
             self.is_poor.add(name)
             self.launcher.interrupt(name)
             return
@@ -261,7 +261,7 @@ class _Loop:
         for name, code in self.launcher.ended().items():
             training, trial = self.status.running.pop(name), self.trials.pop(name)
             run = Run(self.folder / name) if (self.folder / name / "config.json").exists() else None
-            diverged = run is not None and _has_diverged(run)
+            diverged = run is not None and any(map(run.has_diverged, run.seeds))
             returns = [] if run is None else list(self.search.returns(run).values())
             if diverged or (code and name in self.is_poor):
                 self.study.tell(trial, state=states.PRUNED)
@@ -285,7 +285,3 @@ class _Loop:
         if len(self.status.failed) >= PATIENCE and not (self.status.finished or self.status.pruned):
             logs = f"fix the cause; {self.folder}/logs has the output of each"
             raise UserError(f"The first {len(self.status.failed)} trials failed ({why.rstrip('.')}): {logs}.")
-
-
-def _has_diverged(run: Run) -> bool:
-    return any(True for seed in run.seeds for _ in run.rows(seed, "diverged"))

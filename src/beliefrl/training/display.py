@@ -15,7 +15,7 @@ from beliefrl.analysis.figures import curve_figure
 from beliefrl.analysis.tables import measure_text
 from beliefrl.runs.best import evaluations
 from beliefrl.runs.checkpoint import listed
-from beliefrl.runs.records import finite_mean, finite_or_none
+from beliefrl.runs.records import finite_mean, finite_or_none, sessions
 from beliefrl.runs.run import Run
 from beliefrl.training.evaluation import as_argument
 from beliefrl.training.schedule import Event, Phase
@@ -179,7 +179,7 @@ def run_table(run: Run, agent: Any) -> Table:
         if found is not None:
             add("best agent", f"seed {seed} at step {found['step']:,}: return {found['return']:.1f} sampled")
     add("checkpoints", ", ".join(path.name for path in listed(run.folder)) or "none")
-    for index, session in enumerate([config, *config.get("resumed", ())]):
+    for index, session in enumerate(sessions(config)):
         began = f"{session.get('started', '?')} to {session.get('ended', '?')}, {session.get('device', '?')}"
         versions = " ".join(f"{name} {version}" for name, version in session.get("versions", {}).items())
         table.add_section()

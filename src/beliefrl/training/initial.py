@@ -16,6 +16,7 @@ from beliefrl.agents import Agent
 from beliefrl.agents.hyperparameters import values_before
 from beliefrl.runs import arrays, best
 from beliefrl.runs.options import Options
+from beliefrl.runs.records import sessions
 from beliefrl.runs.run import Run
 from beliefrl.training import initial_replay
 from beliefrl.training.phases import SeedState
@@ -62,7 +63,7 @@ def taken(options: Options, agent: Agent, spec: Spec) -> tuple[dict[str, np.ndar
     seeds, index = range(options.seed, options.seed + options.seeds), seeds_there(options)
     ends = best.evaluations(source.folder, len(source.seeds)) if options.init_best else _last_steps(source)
     _refuse_untrained(source, agent, [ends[at] for at in index])
-    session = [source.config, *source.config.get("resumed", ())][-1]
+    session = sessions(source.config)[-1]
     origin = {
         "run": str(source.folder),
         "agent": source.config["agent"],
@@ -112,8 +113,7 @@ def _last_steps(source: Run) -> list[dict[str, Any] | None]:
     steps = []
     for seed in source.seeds:
         evaluated = max((row["step"] for row in source.rows(seed, "evaluation")), default=None)
-        diverged = any(source.rows(seed, "diverged"))
-        steps.append(int(saved) if saved.isdecimal() and not diverged else evaluated)
+        steps.append(int(saved) if saved.isdecimal() and not source.has_diverged(seed) else evaluated)
     return [None if step is None else {"step": step} for step in steps]
 
 

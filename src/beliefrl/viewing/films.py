@@ -21,6 +21,7 @@ from PIL import Image, ImageDraw, ImageFont
 from beliefrl.agents import Agent, is_own
 from beliefrl.analysis import figures
 from beliefrl.runs.arrays import replacing
+from beliefrl.runs.given_files import check_folder
 from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.drawing import INK, PAPER, Viewer
@@ -120,7 +121,7 @@ def kind_of(path: pathlib.Path) -> str:
             import imageio_ffmpeg  # noqa: F401  # pyright: ignore[reportMissingImports]
         except ImportError:
             raise UserError("An mp4 needs imageio-ffmpeg: pip install 'beliefrl[video]', or make a .gif.") from None
-    figures.check_folder(path)
+    check_folder(path)
     return kind
 
 
