@@ -18,7 +18,8 @@ from beliefrl.commands.arguments import parse
 from beliefrl.commands.pictures import DemoOptions, FilmOptions, PredictOptions
 from beliefrl.errors import UserError
 from beliefrl.runs.run import Run
-from beliefrl.sweeps.plan import grid, plan
+from beliefrl.sweeps.experiments import grid
+from beliefrl.sweeps.plan import plan
 from beliefrl.sweeps.run import sweep
 from mistakes import MISTAKES, TRAIN, prepare
 from worlds import installed

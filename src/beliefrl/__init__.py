@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from beliefrl.report import write_report
     from beliefrl.runs.options import Options
     from beliefrl.runs.run import Run
-    from beliefrl.sweeps.plan import Experiment, grid
+    from beliefrl.sweeps.experiments import Experiment, grid
     from beliefrl.sweeps.run import SweepStatus, sweep
     from beliefrl.sweeps.tune import Tuned, tune
     from beliefrl.tasks import Task, observe, with_action_repeat, with_faults
@@ -95,7 +95,7 @@ __all__ = [
 _HOMES = {
     "Agent": "agents:Agent",
     "Event": "training.schedule:Event",
-    "Experiment": "sweeps.plan:Experiment",
+    "Experiment": "sweeps.experiments:Experiment",
     "Faults": "tasks.faults:Faults",
     "GymnasiumTask": "tasks.gymnasium:GymnasiumTask",
     "Options": "runs.options:Options",
@@ -122,7 +122,7 @@ _HOMES = {
     "draw_predictions": "viewing.prediction:draw_predictions",
     "evaluate": "training.evaluation:evaluate",
     "film": "viewing.films:film",
-    "grid": "sweeps.plan:grid",
+    "grid": "sweeps.experiments:grid",
     "load": "policy:load",
     "make_agent": "agents:make",
     "make_task": "tasks:make",

@@ -50,7 +50,7 @@ class Policy:
     ):
         """Make a policy of an agent and one of its trained states.
 
-        `seed` is the random seed of sampled actions, `precision` that of matrix products (`Run.precision`), `task` a
+        `seed` is the random seed of sampled actions, `precision` that of matrix products, `task` a
         name for `repr`. `environment` makes an environment as the agent sees it, to check an ONNX export in.
         `interface` has the names of the observed entries and the bounds of the actions, which an ONNX file records.
         """
@@ -250,7 +250,7 @@ def load(
     trained, spec, interface, state = restore_policy(run, seed, task, agent, best)
     environment = None if run.options.share_env else lambda: _environment(run, task)
     seed = run.seeds[0] if seed is None else seed
-    return Policy(trained, spec, state, seed, run.precision, run.config["task"], environment, interface)
+    return Policy(trained, spec, state, seed, run.options.precision, run.config["task"], environment, interface)
 
 
 def _environment(run: Run, task: Any) -> Any:

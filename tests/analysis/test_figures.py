@@ -173,6 +173,7 @@ def test_what_would_break_a_table_is_escaped():
     assert markdown(columns, [("x|y", "1")]) == "| a | b |\n| --- | ---: |\n| x\\|y | 1 |\n"
     assert r"a\_b & 5\% $\pm$ 1 \\" in latex(columns, [("a_b", "5% ± 1")])
     assert r"\#1 & a \& b \\" in latex(columns, [("#1", "a & b")])
+    assert r"\{1\} & \textbackslash{}x \^{} \~{} \$ \\" in latex(columns, [("{1}", r"\x ^ ~ $")])
 
 
 @pytest.mark.parametrize("command", ["figure table", "report"])

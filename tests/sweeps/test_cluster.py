@@ -14,7 +14,7 @@ import time
 import pytest
 
 from beliefrl import sweep
-from beliefrl.sweeps.plan import grid
+from beliefrl.sweeps.experiments import grid
 from beliefrl.types import UserError
 
 pytest.importorskip("ray", reason="Ray is not installed: pip install 'beliefrl[sweep]'.")

@@ -15,7 +15,8 @@ from beliefrl import cli, sweep
 from beliefrl.runs.run import Run
 from beliefrl.sweeps import places
 from beliefrl.sweeps import progress as module
-from beliefrl.sweeps.plan import Experiment, Training, grid, plan
+from beliefrl.sweeps.experiments import Experiment, grid
+from beliefrl.sweeps.plan import Training, plan
 from beliefrl.sweeps.progress import Forecast
 from beliefrl.sweeps.run import SweepStatus, reason
 from beliefrl.training.stop import Stopped

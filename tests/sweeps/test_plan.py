@@ -7,7 +7,8 @@ import pytest
 from beliefrl import tasks
 from beliefrl.runs.run import Recorder
 from beliefrl.sweeps import sources
-from beliefrl.sweeps.plan import Experiment, extended, grid, plan, shrunk
+from beliefrl.sweeps.experiments import Experiment, grid
+from beliefrl.sweeps.plan import extended, plan, shrunk
 from beliefrl.sweeps.sources import load, read, write
 from beliefrl.types import UserError
 

@@ -9,7 +9,7 @@ import pytest
 from beliefrl import cli, sweep
 from beliefrl.sweeps import run as runs
 from beliefrl.sweeps import sources
-from beliefrl.sweeps.plan import Experiment, grid
+from beliefrl.sweeps.experiments import Experiment, grid
 from beliefrl.training.stop import Stopped
 from beliefrl.types import UserError
 from inputs import Places

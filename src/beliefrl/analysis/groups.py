@@ -2,13 +2,14 @@
 
 import os
 import pathlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from beliefrl.analysis import results
+from beliefrl.runs.given_files import as_path
 from beliefrl.runs.options import Options
 from beliefrl.runs.records import finite_mean, steps_per_action
 from beliefrl.runs.run import Row, Run
@@ -118,8 +119,8 @@ def find(
     found: dict[pathlib.Path, Run] = {}
     unreadable: dict[pathlib.Path, str] = {}
     logs: list[str] = []
-    given = [paths] if isinstance(paths, str | os.PathLike) else paths
-    for path in map(pathlib.Path, given):
+    given = paths if isinstance(paths, Iterable) and not isinstance(paths, str) else [paths]
+    for path in map(as_path, given):
         if path.name.endswith(results.ENDING):
             found |= {run.folder: run for run in results.read(path)}
             continue

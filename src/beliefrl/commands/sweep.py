@@ -77,6 +77,7 @@ def _experiments(options: SweepOptions) -> list:
     """The experiments that the options define. Empty: continue the sweep in --out."""
     from beliefrl.runs.options import Options
     from beliefrl.sweeps import plan, sources
+    from beliefrl.sweeps.experiments import grid
     from beliefrl.types import check_range, check_whole
 
     check_range(options, ("scale",), 0, 1)
@@ -97,7 +98,7 @@ def _experiments(options: SweepOptions) -> list:
         numbers = range(first, first + (count or sources.PRESETS[options.preset].seeds))
         chosen = sources.preset(options.preset, options.tasks, options.agents, numbers)
     elif options.agents and options.tasks:
-        chosen = plan.grid(options.agents, options.tasks, seeds=range(first, first + (count or 5)))
+        chosen = grid(options.agents, options.tasks, seeds=range(first, first + (count or 5)))
     elif options.out is not None and _only_continues(options) and sources.read(options.out):
         return []
     else:

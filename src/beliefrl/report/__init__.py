@@ -20,7 +20,7 @@ from typing import Any
 
 from beliefrl.analysis.groups import find
 from beliefrl.report.data import CachedRun, page_data
-from beliefrl.runs.given_files import check_folder, write_given
+from beliefrl.runs.given_files import as_path, check_folder, write_given
 from beliefrl.types import UserError
 
 
@@ -43,7 +43,7 @@ def write_report(
     Raises:
         UserError: there is no run in a folder, none of the runs can be read, or the page cannot be written.
     """
-    out = pathlib.Path(out)
+    out = as_path(out)
     if out.suffix not in (".html", ".htm"):
         raise UserError(f"{out} must end in .html, such as report.html.")
     if not isinstance(paths, str | os.PathLike) and not paths:

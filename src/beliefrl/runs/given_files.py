@@ -2,9 +2,17 @@
 
 import os
 import pathlib
+from typing import Any
 
 from beliefrl.runs.arrays import write_whole
-from beliefrl.types import UserError, cause
+from beliefrl.types import UserError, cause, short
+
+
+def as_path(value: Any) -> pathlib.Path:
+    """The value as a path. Raise a UserError if it is none."""
+    if not isinstance(value, str | os.PathLike):
+        raise UserError(f"{short(value)} is no path: give a text or a pathlib.Path.")
+    return pathlib.Path(value)
 
 
 def check_folder(path: pathlib.Path) -> None:

@@ -30,6 +30,7 @@ from beliefrl.runs import arrays, records, trackers
 from beliefrl.runs.arrays import write_whole
 from beliefrl.runs.best import BEST
 from beliefrl.runs.folder import locked, make, write_config
+from beliefrl.runs.given_files import as_path
 from beliefrl.runs.options import Options
 from beliefrl.runs.records import Row, now
 from beliefrl.runs.trackers import Tracker
@@ -85,11 +86,6 @@ class Run:
         """The numbers of the run's seeds."""
         first, count = self.config["options"]["seed"], self.config["options"]["seeds"]
         return list(range(first, first + count))
-
-    @property
-    def precision(self) -> str:
-        """The precision of matrix products, for `jax.default_matmul_precision`; float32 if none was recorded."""
-        return self.options.precision
 
     def rows(self, seed: int, kind: str | None = None) -> Iterator[Row]:
         """The entries of a seed's log in order, or those of one `kind`. Damaged lines are left out.
@@ -186,7 +182,7 @@ class Recorder(Run):
                 written by another process; or a tracker cannot be opened.
         """
         self._given = str(folder)
-        folder = pathlib.Path.cwd() / folder  # an environment may change the working directory
+        folder = pathlib.Path.cwd() / as_path(folder)  # an environment may change the working directory
         if config is not None:
             make(folder, config)
         super().__init__(folder)

@@ -10,7 +10,6 @@ A sweep's folder:
 
 import dataclasses
 import hashlib
-import itertools
 import json
 import pathlib
 import re
@@ -20,6 +19,7 @@ from typing import Any
 from beliefrl import agents, tasks
 from beliefrl.runs.options import Options
 from beliefrl.runs.run import Run
+from beliefrl.sweeps.experiments import Experiment
 from beliefrl.tasks.faults import Faults
 from beliefrl.training.schedule import capacity
 from beliefrl.types import UserError, plain
@@ -28,30 +28,6 @@ OPTIONS = tuple(field.name for field in dataclasses.fields(Options))
 FAULTS = tuple(field.name for field in dataclasses.fields(Faults))
 SHRINKS = ("step_start_rl", "train_times_fivrm", "pretrain_updates")  # hyperparameters that count steps or updates
 LONGEST_NAME = 120  # characters of a folder's name, without the seeds
-
-
-@dataclasses.dataclass(frozen=True)
-class Experiment:
-    """An agent with its settings on a task, and the seeds to train: one line of a figure."""
-
-    agent: str
-    """The agent's name."""
-    task: str
-    """The task's name, such as pendulum-v or gym:MountainCarContinuous-v0."""
-    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Hyperparameters of the agent, training options (`beliefrl.Options`) such as steps, and faults of the sensors
-    (`beliefrl.Faults`) such as noise."""
-    seeds: Sequence[int] = (0, 1, 2, 3, 4)
-    """The seed numbers; the paper uses 5 seeds (Appendix B)."""
-    observe: Sequence[int | str] | int | str | None = None
-    """Entries of the observation that the agent sees, as in `make_task`; empty: all."""
-    constants: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """The task's constants, as in `make_task`."""
-
-    def __post_init__(self) -> None:
-        """Refuse a number of seeds with a UserError."""
-        if isinstance(self.seeds, int):
-            raise UserError(f"seeds={self.seeds} is impossible: give the seed numbers, such as (0, 1, 2), or use grid.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,39 +74,6 @@ class Training:
             return has_all_steps or run.reached(options.stop_at, options.stop_patience)
         except UserError:
             return False  # it is damaged, and the training says so
-
-
-def grid(
-    agents: Sequence[str],
-    tasks: Sequence[str],
-    settings: Mapping[str, Sequence[Any]] | None = None,
-    seeds: int | Sequence[int] = 5,
-    **fixed: Any,
-) -> list[Experiment]:
-    """Experiments: every agent on every task with every combination of settings.
-
-        beliefrl.grid(["vrm", "sac-mlp"], ["pendulum-v"], {"lr_critic": [3e-4, 1e-3]}, seeds=3, steps=15_000)
-
-    Args:
-        agents, tasks: names.
-        settings: the values to try, for each hyperparameter or fault of the sensors.
-        seeds: the number of seeds, counted from 0, or a list of seed numbers.
-        fixed: settings with one value.
-
-    Raises:
-        UserError: the values of a setting are not a list.
-    """
-    for name, value in (settings or {}).items():
-        if isinstance(value, str) or not isinstance(value, Iterable):
-            raise UserError(f"{name}={value} is not a list of values: give [{value!r}], or {name}= as an argument.")
-    names, values = list(settings or {}), list((settings or {}).values())
-    numbers = range(seeds) if isinstance(seeds, int) else seeds
-    return [
-        Experiment(agent, task, {**fixed, **dict(zip(names, combination, strict=True))}, tuple(numbers))
-        for task in tasks
-        for agent in agents
-        for combination in itertools.product(*values)
-    ]
 
 
 def shrunk(experiment: Experiment, scale: float) -> Experiment:

@@ -10,15 +10,17 @@ from typing import Any, Protocol, runtime_checkable
 
 from beliefrl import agents
 from beliefrl.runs.folder import locked
+from beliefrl.runs.given_files import as_path
 from beliefrl.runs.options import Options
 from beliefrl.runs.run import Run
 from beliefrl.sweeps import places, sources
 from beliefrl.sweeps import plan as plans
-from beliefrl.sweeps.plan import Experiment, Training
+from beliefrl.sweeps.experiments import Experiment
+from beliefrl.sweeps.plan import Training
 from beliefrl.sweeps.progress import SweepDisplay, SweepStatus
 from beliefrl.training.checks import CHANGEABLE
 from beliefrl.training.stop import Requests, Stopped
-from beliefrl.types import UserError, cause, check_whole, one_line, plain
+from beliefrl.types import UserError, cause, check_whole, one_line, plain, short
 
 LOOK_EVERY = 0.5  # seconds
 HARMLESS = ("seed", "seeds", "processes", "checkpoint_steps", "checkpoint_minutes", "keep_checkpoints", "track")
@@ -69,7 +71,9 @@ def sweep(
         raise UserError("experiments must be a list of beliefrl.Experiment: beliefrl.grid makes one.")
     check_whole("workers", 0 if workers is None else workers, 0)
     check_whole("seeds_per_run", 1 if seeds_per_run is None else seeds_per_run, 1)
-    folder = pathlib.Path(out)
+    if ray is not None and not isinstance(ray, str):
+        raise UserError(f"ray={short(ray)} is impossible: give HOST:PORT of the head, or auto.")
+    folder = as_path(out)
     plans.plan(experiments)  # raise errors before a folder is made
     with lock(folder):
         before = sources.read(folder)

@@ -14,7 +14,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from beliefrl.runs.arrays import write_whole
-from beliefrl.sweeps.plan import Experiment, Training, grid
+from beliefrl.sweeps.experiments import Experiment, grid
+from beliefrl.sweeps.plan import Training
 from beliefrl.types import UserError, plain, said
 
 PLAN = "sweep.json"  # in the folder of a sweep

@@ -17,7 +17,8 @@ from beliefrl.analysis import figures
 from beliefrl.runs.options import Options
 from beliefrl.runs.run import Run
 from beliefrl.sweeps import ranges
-from beliefrl.sweeps.plan import Experiment, Training, agent_of, plan
+from beliefrl.sweeps.experiments import Experiment
+from beliefrl.sweeps.plan import Training, agent_of, plan
 from beliefrl.types import UserError, plain, short
 
 JOURNAL = "study.journal"

@@ -15,19 +15,21 @@ import pathlib
 import re
 import shlex
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, get_args
 
 from beliefrl.agents.hyperparameters import Ranges
+from beliefrl.runs.given_files import as_path
 from beliefrl.runs.options import Options
 from beliefrl.runs.run import Run
 from beliefrl.sweeps import places, ranges, study
-from beliefrl.sweeps.plan import Experiment, Training
+from beliefrl.sweeps.experiments import Experiment
+from beliefrl.sweeps.plan import Training
 from beliefrl.sweeps.progress import SweepStatus
 from beliefrl.sweeps.run import lock, reason, reporting
 from beliefrl.sweeps.study import Actions, Objective, Search, Trial
 from beliefrl.training.stop import Requests, Stopped
-from beliefrl.types import UserError, cause, check_whole
+from beliefrl.types import UserError, cause, check_whole, short
 
 LOOK_EVERY = 1.0  # seconds
 PATIENCE = 3  # failures, without any other trial, after which tuning ends
@@ -99,10 +101,11 @@ def tune(
         Stopped: Ctrl-C or SIGTERM, after every trial has written a checkpoint. It is a KeyboardInterrupt.
     """
     _check(trials, seeds, seed, workers, objective, actions)
+    _check_names(ranges, only)
     experiment = Experiment(agent, task, settings or {}, range(seed, seed + seeds), observe, constants or {})
     search = Search(experiment, ranges or {}, only, objective, actions)
     study.optuna()  # raises an error if it is not installed
-    folder = pathlib.Path(out or pathlib.Path("runs") / re.sub(r"[^\w.-]+", "-", f"tune-{agent}-{task}"))
+    folder = as_path(out or pathlib.Path("runs") / re.sub(r"[^\w.-]+", "-", f"tune-{agent}-{task}"))
     _check_folder(folder)
     try:
         return _run(folder, search, trials, prune, workers, progress)
@@ -148,6 +151,14 @@ def _check(trials: int, seeds: int, seed: int, workers: int | None, objective: s
     for name, value, known in (("objective", objective, Objective), ("actions", actions, Actions)):
         if value not in get_args(known):
             raise UserError(f"{name}={value} is impossible: it must be {' or '.join(get_args(known))}.")
+
+
+def _check_names(ranges: Any, only: Any) -> None:
+    """Raise a UserError if the hyperparameters to search have no names."""
+    if not isinstance(ranges, Mapping | None):
+        raise UserError(f"ranges={short(ranges)} is impossible: give a dictionary from names to ranges.")
+    if isinstance(only, str) or not isinstance(only, Iterable):
+        raise UserError(f"only={short(only)} is impossible: give a list of names.")
 
 
 def _check_folder(folder: pathlib.Path) -> None:

@@ -21,7 +21,7 @@ from beliefrl.tasks.observed import entries as entries
 from beliefrl.tasks.observed import entry_names as entry_names
 from beliefrl.tasks.observed import full as full
 from beliefrl.tasks.variants import as_task, observe, steps_per_action, with_action_repeat, with_faults
-from beliefrl.types import Spec, UserError, said, tuples
+from beliefrl.types import Spec, UserError, said, short, tuples
 
 
 @runtime_checkable
@@ -127,6 +127,8 @@ def make(
 
 
 def _make(name: str, constants: dict[str, Any]) -> Any:
+    if not isinstance(name, str):
+        raise UserError(f"{short(name)} is not the name of a task: make_task takes a name.")
     if name.startswith(PREFIX):
         return registered.make(name.removeprefix(PREFIX), constants)
     if name not in our_names():

@@ -9,7 +9,7 @@ from beliefrl.runs.records import steps_per_action
 from beliefrl.runs.run import Run
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.schedule import Options
-from beliefrl.types import UserError, plain
+from beliefrl.types import UserError, plain, short
 
 CHANGEABLE = ("steps", "stop_at", "stop_patience", "step_timeout")  # options that may differ when a training continues
 
@@ -18,6 +18,13 @@ def patience(options: Options) -> None:
     """Raise a UserError if `stop_patience` is given without `stop_at`."""
     if options.stop_patience != 1 and options.stop_at is None:
         raise UserError(f"stop_patience={options.stop_patience} needs stop_at: give the return, too.")
+
+
+def listeners(**functions: Any) -> None:
+    """Raise a UserError for an argument that is not None and cannot be called."""
+    for name, function in functions.items():
+        if function is not None and not callable(function):
+            raise UserError(f"{name}={short(function)} is impossible: give a function of an Event.")
 
 
 def possible(options: Options, task: Any, own_process: bool) -> None:

@@ -57,7 +57,7 @@ def summary(result: Episode) -> dict[str, Any]:
 def restore(
     run: Run, task: Task | GymnasiumTask | type | None = None, agent: Agent | type | None = None, best: bool = False
 ) -> tuple[Agent, Any, Any, str]:
-    """The agent, the task, the trained states (leading axis: seed) and the precision (`Run.precision`) of a run.
+    """The agent, the task, the trained states (leading axis: seed) and the precision (an option) of a run.
 
     `task` is needed only if the run was trained on a task of your own, `agent` only if an agent of your own was trained
     (`agent_of`). The states are those of the last evaluation, or of the best one of each seed.
@@ -68,7 +68,7 @@ def restore(
     made = agent_of(run, agent)
     found = task_of(run, task)
     check_interface(run, found)
-    return made, found, _states(run, made, found.spec, best), run.precision
+    return made, found, _states(run, made, found.spec, best), run.options.precision
 
 
 def _states(run: Run, agent: Agent, spec: Spec, best: bool) -> Any:

@@ -68,6 +68,7 @@ def train(
             everything until that step is saved, unless nothing was learned yet.
         Stopped: Ctrl-C or SIGTERM, after a checkpoint is written; `resume` continues. It is a KeyboardInterrupt.
     """
+    checks.listeners(report=report, callback=callback)
     agent = agents.given(agent)
     made: Any = tasks.given(task)
     chosen = _chosen(options)
@@ -132,6 +133,7 @@ def resume(
             small, or `task` is another one.
         Stopped: Ctrl-C or SIGTERM, after a checkpoint is written.
     """
+    checks.listeners(report=report, callback=callback)
     limits = {"stop_at": stop_at, "step_timeout": step_timeout}
     numbers = {"steps": steps, "stop_patience": stop_patience}
     changes: dict[str, Any] = {name: value for name, value in limits.items() if value != "same"}

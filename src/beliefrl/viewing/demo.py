@@ -8,6 +8,7 @@ import os
 import pathlib
 import zipfile
 
+from beliefrl.runs.given_files import as_path
 from beliefrl.runs.run import Run
 from beliefrl.types import UserError, cause, short
 
@@ -33,7 +34,7 @@ def demo(task: str, folder: str | os.PathLike[str]) -> Run:
     """
     if task not in names():
         raise UserError(f"There is no trained agent for {short(task)}: there is one for {', '.join(names())}.")
-    folder = pathlib.Path(folder)
+    folder = as_path(folder)
     try:
         folder.mkdir(parents=True)
         with zipfile.ZipFile(FOLDER / f"{task}.zip") as packed:

@@ -70,7 +70,7 @@ class Player:
         precision: str = "float32",
         rendered: bool = False,
     ):
-        """`precision` is for matrix products (`Run.precision`). `rendered` must be true if frames will be requested.
+        """`precision` is for matrix products. `rendered` must be true if frames will be requested.
 
         Raises:
             UserError: the environment cannot be made, or cannot be rendered although it must.

@@ -10,7 +10,7 @@ import math
 import os
 import pathlib
 import subprocess
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -252,7 +252,7 @@ def film(
         raise UserError(f"start={start} is impossible: it must be less than steps={steps}.")
     if not runs:
         raise UserError("RUN is missing: give one or more runs.")
-    given = [runs] if isinstance(runs, Run | str | os.PathLike) else runs
+    given = runs if isinstance(runs, Iterable) and not isinstance(runs, str) else [runs]
     runs = [run if isinstance(run, Run) else Run(run) for run in given]
     path = pathlib.Path(path or runs[0].folder / "film.png")
     figures.paths(path)

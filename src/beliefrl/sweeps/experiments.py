@@ -1,0 +1,81 @@
+"""What to train: agents with settings, on tasks, with seeds."""
+
+import dataclasses
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from beliefrl.types import UserError, short
+
+NAMED = Mapping, "a dictionary from names to values"
+KINDS = (
+    ("agent", str, "its name"),
+    ("task", str, "its name"),
+    ("settings", *NAMED),
+    ("constants", *NAMED),
+    ("observe", Sequence | int | None, "entries of the observation"),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """An agent with its settings on a task, and the seeds to train: one line of a figure."""
+
+    agent: str
+    """The agent's name."""
+    task: str
+    """The task's name, such as pendulum-v or gym:MountainCarContinuous-v0."""
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Hyperparameters of the agent, training options (`beliefrl.Options`) such as steps, and faults of the sensors
+    (`beliefrl.Faults`) such as noise."""
+    seeds: Sequence[int] = (0, 1, 2, 3, 4)
+    """The seed numbers; the paper uses 5 seeds (Appendix B)."""
+    observe: Sequence[int | str] | int | str | None = None
+    """Entries of the observation that the agent sees, as in `make_task`; empty: all."""
+    constants: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """The task's constants, as in `make_task`."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible types, and a number of seeds, with a UserError."""
+        for name, kinds, what in KINDS:
+            value = getattr(self, name)
+            if not isinstance(value, kinds):
+                raise UserError(f"{name}={short(value)} is impossible: give {what}.")
+        if isinstance(self.seeds, int | str):
+            raise UserError(f"seeds={self.seeds} is impossible: give the seed numbers, such as (0, 1, 2), or use grid.")
+
+
+def grid(
+    agents: Sequence[str],
+    tasks: Sequence[str],
+    settings: Mapping[str, Sequence[Any]] | None = None,
+    seeds: int | Sequence[int] = 5,
+    **fixed: Any,
+) -> list[Experiment]:
+    """Experiments: every agent on every task with every combination of settings.
+
+        beliefrl.grid(["vrm", "sac-mlp"], ["pendulum-v"], {"lr_critic": [3e-4, 1e-3]}, seeds=3, steps=15_000)
+
+    Args:
+        agents, tasks: names.
+        settings: the values to try, for each hyperparameter or fault of the sensors.
+        seeds: the number of seeds, counted from 0, or a list of seed numbers.
+        fixed: settings with one value.
+
+    Raises:
+        UserError: the values of a setting are not a list.
+    """
+    agents, tasks = ([names] if isinstance(names, str) else names for names in (agents, tasks))
+    if not isinstance(settings, Mapping | None):
+        raise UserError(f"settings={short(settings)} is impossible: give a dictionary from names to lists of values.")
+    for name, value in (settings or {}).items():
+        if isinstance(value, str) or not isinstance(value, Iterable):
+            raise UserError(f"{name}={value} is not a list of values: give [{value!r}], or {name}= as an argument.")
+    names, values = list(settings or {}), list((settings or {}).values())
+    numbers = range(seeds) if isinstance(seeds, int) else seeds
+    return [
+        Experiment(agent, task, {**fixed, **dict(zip(names, combination, strict=True))}, tuple(numbers))
+        for task in tasks
+        for agent in agents
+        for combination in itertools.product(*values)
+    ]
