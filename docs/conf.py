@@ -39,7 +39,7 @@ nitpicky = True
 nitpick_ignore_regex = [
     ("py:.*", r"(?!beliefrl\.).*"),  # names of other libraries
     ("py:class", r"beliefrl\.models\.(soft_actor_critic\.Network|nets\.Params)"),  # type variables
-    ("py:class", r"beliefrl\.tasks\.(faults\.Draws|check\.Entry|interface\.Interface)"),  # parts of others
+    ("py:class", r"beliefrl\.tasks\.(faults\.Draws|check_warnings\.Entry|interface\.Interface)"),  # parts of others
 ]
 
 html_theme = "furo"
