@@ -197,6 +197,8 @@ def test_a_wrapper_may_change_the_observation_and_name_its_entries():
     for wrapper, names in ((TimeAwareObservation, ("entry 0", "entry 1", "entry 2")), (Named, Named.entry_names)):
         task = GymnasiumTask(lambda wrapper=wrapper: wrapper(TimeLimit(inner(), 9)))
         assert task.entry_names == names
+        assert task.spec.max_steps == 9
+        assert "no time limit" not in " ".join(beliefrl.check(task, steps=3).warnings)
 
 
 def test_names_that_cannot_be_read_are_ignored():

@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit
 
 from beliefrl.errors import Fault
 from beliefrl.tasks.faults import STREAM, Draws
@@ -49,8 +50,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         self._lowest, self._highest = limits(self.inner_observation_space, self.indices)
         self.observation_space = spaces.Box(-np.inf, np.inf, (self.indices.size,), np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (self.inner_action_space.low.size,), np.float32)
-        registered = getattr(self.inner, "spec", None)
-        self._longest = task.max_steps or (registered.max_episode_steps if registered else None)  # of its own steps
+        self._longest = task.max_steps or _time_limit(self.inner)  # of its own steps
         self.limit = self._longest and actions(self._longest, task.steps_per_action)  # of the agent's
 
     def reset(
@@ -171,6 +171,18 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         if not isinstance(value, bool | np.bool_ | int | np.integer) or value not in (0, 1):
             raise self._fault(f"{name} is {short(value)}, but must be True or False")
         return bool(value)
+
+
+def _time_limit(environment: Any) -> int | None:
+    """The time limit that an environment was registered with, or that a wrapper gives it."""
+    registered = getattr(environment, "spec", None)
+    if registered:
+        return registered.max_episode_steps
+    while isinstance(environment, gymnasium.Wrapper):
+        if isinstance(environment, TimeLimit):
+            return environment._max_episode_steps
+        environment = environment.env
+    return None
 
 
 class FaultyEnvironment(Environment):
