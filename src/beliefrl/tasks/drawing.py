@@ -98,7 +98,7 @@ class Viewer:
             raise UserError("A window needs pygame: pip install 'beliefrl[render]'.") from None
         self._pygame, self._title, self._clock = pygame, title, pygame.time.Clock()
 
-    def show(self, pixels: UInt8[np.ndarray, "height width 3"], fps: float) -> None:
+    def show(self, pixels: UInt8[np.ndarray, "height width 3"], fps: int | float) -> None:
         """Show a picture, at least 1 / fps seconds after the previous one.
 
         Raises:
