@@ -301,10 +301,14 @@ def test_other_meanings_of_equal_arrays_are_one_sentence(tmp_path, name, setting
         train(tiny(name, **({other: True} if other else {})), TASK, tmp_path / "run", init_from=source)
 
 
-def test_agents_that_were_not_pretrained_are_refused(tmp_path):
+@pytest.mark.parametrize("envs", [1, 16])
+def test_agents_that_were_not_pretrained_are_refused(tmp_path, envs):
     agent = tiny("predictive-sac")
     source = saved(tmp_path / "source", "predictive-sac", TASK, agent=agent)
-    early, late = agent.step_start_rl, agent.step_start_rl + 1
+    source.config["options"]["envs"] = envs
+    (source.folder / "config.json").write_text(json.dumps(source.config))
+    early = -(-agent.step_start_rl // envs) * envs
+    late = early + 1
     options = Options(init_from=str(source.folder), seed=4)
     log = source.folder / "metrics" / "seed-4.jsonl"
     log.write_text(json.dumps({"kind": "evaluation", "step": early, "sampled": [-1.0], "mode": [-1.0]}) + "\n")

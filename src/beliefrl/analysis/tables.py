@@ -23,8 +23,6 @@ from beliefrl.types import UserError
 
 SOLVED = 0.95  # score (`aggregate`): a return of -203 on the pendulum, 951 on CartPole, 133 on target reaching
 TIMED_STEPS = 100_000  # as in the paper's table
-
-
 IN_LATEX = str.maketrans(
     {each: f"\\{each}" for each in "_%#&${}"} | {"\\": r"\textbackslash{}", "^": r"\^{}", "~": r"\~{}", "±": r"$\pm$"}
 )

@@ -28,7 +28,7 @@ class PredictOptions:
     """The model to use: lstm for predictive-sac, keep or first for vrm, latent for slac. None: the first of these that
     the agent has."""
     start: int | None = None
-    """Number of timesteps that the closed loop observes. None: 50, or half of an episode of less than 100."""
+    """Number of timesteps that the closed loop observes. None: 50, or half of an episode with fewer than 100."""
     horizon: int = 100
     """Number of timesteps that the closed loop predicts after that, at most to the end of the episode."""
     samples: int = 32

@@ -37,7 +37,7 @@ class SweepOptions:
     """Environment steps per seed. None: those of the preset, or 20,000."""
     set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE[,VALUE...]")] = ()
     """Hyperparameters of the agents, or faults of the sensors such as noise. Every combination of the given values is
-    trained. An option of the training can be set, too, but to one value."""
+    trained. Options of the training can be set too, but only to one value."""
     observe: Annotated[tuple[str, ...], tyro.conf.arg(metavar="ENTRIES")] = ()
     """Entries of the observation that the agents see, as in `beliefrl train`."""
     constants: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()

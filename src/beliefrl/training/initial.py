@@ -119,7 +119,8 @@ def _last_steps(source: Run) -> list[dict[str, Any] | None]:
 
 def _refuse_untrained(source: Run, agent: Agent, ends: list[dict[str, Any] | None]) -> None:
     """Refuse agents that were saved before their pre-training: a training with init_from has none."""
-    explored = source.config["hyperparameters"].get("step_start_rl", 0)
+    envs = source.options.envs
+    explored = -(-source.config["hyperparameters"].get("step_start_rl", 0) // envs) * envs
     if not agent.pretrain_updates or "initial" in source.config:
         return
     for end in ends:

@@ -95,8 +95,8 @@ def predictions(
         seed: one of the run's seeds; None: its first.
         model: "lstm" for predictive-sac, "keep" or "first" for vrm, "latent" for slac; None: the first of these that
             the agent has.
-        start: number of timesteps that the closed loop observes; None: 50, or half of an episode of
-            less than 100.
+        start: number of timesteps that the closed loop observes; None: 50, or half of an episode with
+            fewer than 100.
         horizon: number of timesteps that it predicts after that, at most to the end of the episode.
         samples: number of samples in the mean of each prediction.
         episode_seed: random seed of the episode, its actions and the samples.
