@@ -186,7 +186,10 @@ def test_train_goes_on_where_it_is_asked_to(whole, tmp_path):
         train(AGENT, "pendulum-v", folder, crash_at(whole[1] - 4), resume=True, **OPTIONS)
     with pytest.raises(UserError, match=r"exists already: .* in Python out= or resume=True\."):
         train(AGENT, "pendulum-v", folder, **OPTIONS)
-    with pytest.raises(UserError, match=r"was trained with seeds=2, not 3: choose another --out, in Python out=\."):
+    message = (
+        r"was trained with seeds=2, not 3: choose another --out, in Python out=\. `beliefrl resume \S+run` continues it"
+    )
+    with pytest.raises(UserError, match=message):
         train(AGENT, "pendulum-v", folder, resume=True, **OPTIONS | {"seeds": 3})
     for _ in range(2):
         run = train(AGENT, "pendulum-v", folder, resume=True, **OPTIONS)

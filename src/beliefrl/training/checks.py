@@ -60,8 +60,10 @@ def same(run: Run, config: dict[str, Any], older: dict[str, Any]) -> None:
     there |= {name: asked[name] for name in CHANGEABLE}
     for name, value in asked.items():
         if there.get(name, value) != value:
-            change = "choose another --out, in Python out="
-            raise UserError(f"{run.folder} was trained with {name}={there[name]}, not {value}: {change}.")
+            raise UserError(
+                f"{run.folder} was trained with {name}={there[name]}, not {value}: choose another --out, in Python "
+                f"out=. `beliefrl resume {run.shown}` continues it with its own settings."
+            )
 
 
 def same_task(run: Run, task: Any) -> None:
