@@ -188,6 +188,25 @@ def test_without_time_constants_there_is_no_memory_of_rewards_or_observations():
     assert agent.note(memory).observations is None
 
 
+def test_an_agent_that_does_not_perceive_the_reward_still_learns_to_predict_it():
+    agent = dataclasses.replace(AGENT, perceive_reward=False)
+    state = jax.jit(lambda key: agent.init(key, SPEC))(jax.random.key(0))
+    state = usual(state, 0.0, 0.0)  # every reward is unusual
+    window = noted(windows(jax.random.key(1), 2, TIME))
+    window = window._replace(note=window.note._replace(rewards=jnp.zeros((TIME, 2, 0))))
+    other = window._replace(step=window.step._replace(reward=window.step.reward.at[3, 0].add(5.0)))
+    learn = jax.jit(agent.learn_model)
+    (after, belief, metrics), (_, same_belief, changed) = learn(state, window), learn(state, other)
+    np.testing.assert_array_equal(belief, same_belief)
+    assert abs(changed["loss_model"] / metrics["loss_model"] - 1) > 1e-3
+    assert belief.shape[-1] == agent.d_size + SPEC.obs_dim + SPEC.action_dim + SPEC.obs_dim * 2
+    assert not same(after.model, state.model)
+    step = jax.tree.map(lambda leaf: leaf[0, 0], window.step)._replace(is_first=jnp.array(False))
+    others, act = (agent.reset(SPEC), jax.random.key(2), jnp.array(False)), jax.jit(agent.act)
+    zero, nine = (act(state, others[0], step._replace(reward=jnp.array(r)), *others[1:]) for r in (0.0, 9.0))
+    assert same(zero, nine)
+
+
 def test_equal_rewards_tell_no_time(state):
     """Where all rewards are alike, as on CartPole, the memory stays empty; so it does before the pre-training."""
     step = jax.tree.map(lambda leaf: leaf[0, 0], windows(jax.random.key(1), 1, TIME).step)
@@ -459,7 +478,7 @@ def test_impossible_values_are_refused(field, value):
 # A recurrent model that learns only to predict: its memories and its loss.
 
 OBS, ACTION, D = 3, 2, 8
-SIZES = OBS, ACTION, 2, D, 6
+SIZES = OBS, ACTION, 8, D, 6
 
 
 def model(long_memories=0.25, longest=50):

@@ -6,8 +6,7 @@ memory of its unusual rewards. It learns during the whole training, and only by 
 reward (`models.predictive_model`). The controller (`models.double_q`) learns on the belief. Its gradient does not reach
 the LSTM.
 
-This agent is not from the paper. It keeps the paper's idea: a recurrent model that learns by prediction forms the
-belief, and a soft actor-critic acts on it. It has one model without latent variables where `vrm` has two with them.
+It is not from the paper, and has one model without latent variables where `vrm` has two with them.
 
 The model reads the replay in order (`training.replay.Readers`): a reader's window begins with the state at the end of
 its last one. So h_t knows the episode since its beginning, or since the reader's last jump, which empties it. Both
@@ -34,7 +33,7 @@ from beliefrl.agents.base import ControllerAgent, Range
 from beliefrl.models import average, double_q, pool, reading
 from beliefrl.models.average import Average
 from beliefrl.models.double_q import DoubleQController, Samples
-from beliefrl.models.forecast import Constants, Memory, Note, forecast, no_memory, perceive
+from beliefrl.models.forecast import Memory, Note, Perceived, forecast, no_memory, perceive
 from beliefrl.models.nets import Gaussian, LSTMState, descend, falling_rate, standardise, update_statistics
 from beliefrl.models.pool import Pool
 from beliefrl.models.predictive_model import PredictiveModel, init_model, prediction_loss
@@ -118,6 +117,8 @@ class PredictiveSACAgent(ControllerAgent):
     """Fraction of the LSTM's cells that start with a long memory, in [0, 1]."""
     longest_memory: int = 127
     """L: these cells start with forget biases of log U(1, L), which are time constants of 2 to L + 1 steps."""
+    perceive_reward: bool = True
+    """Read the last reward. Without it there is no `reward_memory` either, and the trained agent needs no rewards."""
     reward_memory: tuple[float, ...] = (8.0, 64.0, 512.0)
     """Time constants, in steps, of the memory of unusual rewards that the LSTM reads. Without any it reads none."""
     observation_memory: tuple[float, ...] = ()
@@ -150,6 +151,7 @@ class PredictiveSACAgent(ControllerAgent):
         "average_rate": 1.0,
         "critic_likelihood": 0.0,
         "observation_memory": (),
+        "perceive_reward": True,
     }
 
     def __post_init__(self) -> None:
@@ -184,8 +186,9 @@ class PredictiveSACAgent(ControllerAgent):
         return self.sequences
 
     @property
-    def time_constants(self) -> Constants:
-        return Constants(self.reward_memory, self.observation_memory)
+    def perceived(self) -> Perceived:
+        rewards = self.reward_memory if self.perceive_reward else ()
+        return Perceived(self.perceive_reward, rewards, self.observation_memory)
 
     @property
     def model_optimiser(self) -> optax.GradientTransformation:
@@ -194,9 +197,10 @@ class PredictiveSACAgent(ControllerAgent):
     def init(self, key: Key[Array, ""], spec: Spec) -> State:
         key_model, key_controller = jax.random.split(key)
         remembered = spec.obs_dim * len(self.observation_memory)
-        sizes = spec.obs_dim, spec.action_dim, remembered + len(self.reward_memory)
+        x = spec.obs_dim + spec.action_dim + self.perceive_reward + remembered
+        sizes = spec.obs_dim, spec.action_dim, x + len(self.perceived.rewards)
         model = init_model(key_model, *sizes, self.d_size, self.hidden_size, self.long_memories, self.longest_memory)
-        belief = self.d_size + spec.obs_dim + spec.action_dim + 1 + remembered
+        belief = self.d_size + x
         settings = self.policy_layers, self.value_layers, self.alpha_start, self.normalise_critics
         with_sigma = self.critic_likelihood > 0
         controller = double_q.init_controller(key_controller, belief, spec.action_dim, *settings, with_sigma)
@@ -223,12 +227,12 @@ class PredictiveSACAgent(ControllerAgent):
     # Acting
 
     def reset(self, spec: Spec) -> Memory:
-        return no_memory(self.d_size, spec.obs_dim, spec.action_dim, self.time_constants)
+        return no_memory(self.d_size, spec.obs_dim, spec.action_dim, self.perceived)
 
     def act(
         self, state: State, memory: Memory, step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]
     ) -> tuple[Float[Array, " action"], Memory]:
-        memory, x = perceive(state.model, state.scales, memory, step, self.time_constants)
+        memory, x = perceive(state.model, state.scales, memory, step, self.perceived)
         belief = jnp.concatenate([memory.lstm.d, x])
         policy = state.controller.actor(standardise(state.scales.belief, belief))
         return self.choose_from(policy, key, explore), memory._replace(note=memory.note._replace(policy=policy))
@@ -239,7 +243,7 @@ class PredictiveSACAgent(ControllerAgent):
     def predict(
         self, state: State, model: str, step: Timestep, observed: Bool[Array, " time"], key: Key[Array, ""]
     ) -> Gaussian:
-        return forecast(state.model, state.scales, step, observed, self.time_constants)
+        return forecast(state.model, state.scales, step, observed, self.perceived)
 
     # Learning the model
 
@@ -252,7 +256,8 @@ class PredictiveSACAgent(ControllerAgent):
     def learn_model(self, state: State, windows: Window) -> tuple[State, Float[Array, "time batch belief"], Metrics]:
         """One Adam step on J_model; also returns the beliefs, formed before the step and not standardised."""
         scales, step, after = state.scales.include(windows), windows.step, windows.between(1, None).step
-        x, valid = scales.perception(step, windows.note.observations), reading.known_transitions(windows)
+        x = scales.perception(step, windows.note.observations, self.perceive_reward)
+        valid = reading.known_transitions(windows)
         inputs, start = scales.model_input(x, windows.note.rewards), reading.start(windows, state.readers)
 
         def loss(model: PredictiveModel) -> tuple[Float[Array, ""], LSTMState]:

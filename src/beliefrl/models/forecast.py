@@ -17,11 +17,12 @@ from beliefrl.models.scales import Scales
 from beliefrl.types import Timestep
 
 
-class Constants(NamedTuple):
-    """The time constants of both memories, in steps."""
+class Perceived(NamedTuple):
+    """What the LSTM reads besides o_t and a_{t-1}."""
 
-    rewards: tuple[float, ...]
-    observations: tuple[float, ...]
+    reward: bool  # r_{t-1}
+    rewards: tuple[float, ...]  # the time constants of m_t, in steps
+    observations: tuple[float, ...]  # those of n_t
 
 
 class Note(NamedTuple):
@@ -42,29 +43,29 @@ class Memory(NamedTuple):
     note: Note  # on the last timestep
 
 
-def no_memory(d: int, obs: int, action: int, constants: Constants) -> Memory:
+def no_memory(d: int, obs: int, action: int, perceived: Perceived) -> Memory:
     """The memory before an episode, given the sizes of the LSTM's state, the observation and the action."""
-    observations = jnp.zeros((obs, len(constants.observations))) if constants.observations else None
-    note = Note(jnp.zeros(len(constants.rewards)), Policy(*jnp.zeros((2, action))), observations)
+    observations = jnp.zeros((obs, len(perceived.observations))) if perceived.observations else None
+    note = Note(jnp.zeros(len(perceived.rewards)), Policy(*jnp.zeros((2, action))), observations)
     return Memory(LSTMState(*jnp.zeros((2, d))), note)
 
 
 def perceive(
-    model: PredictiveModel, scales: Scales, before: Memory, step: Timestep, constants: Constants
+    model: PredictiveModel, scales: Scales, before: Memory, step: Timestep, perceived: Perceived
 ) -> tuple[Memory, Float[Array, " x"]]:
     """The memory after one more timestep, and x_t. The policy in its note is still the last one; `act` replaces it."""
     excess = jnp.where(step.is_first, 0.0, scales.usual.excess(step.reward))
-    rewards = remember(before.note.rewards, excess, constants.rewards)
+    rewards = remember(before.note.rewards, excess, perceived.rewards)
     observations = before.note.observations
     if observations is not None:
-        observations = remember(observations, step.obs, constants.observations)
-    x = scales.perception(step, observations)
+        observations = remember(observations, step.obs, perceived.observations)
+    x = scales.perception(step, observations, perceived.reward)
     lstm = model.lstm.step(before.lstm, scales.model_input(x, rewards), step.is_first)
     return Memory(lstm, before.note._replace(rewards=rewards, observations=observations)), x
 
 
 def forecast(
-    model: PredictiveModel, scales: Scales, steps: Timestep, observed: Bool[Array, " time"], constants: Constants
+    model: PredictiveModel, scales: Scales, steps: Timestep, observed: Bool[Array, " time"], perceived: Perceived
 ) -> Gaussian:
     """Predictions of (o_t, r_{t-1}) along one episode from its first timestep on, in the units of the task.
 
@@ -75,12 +76,12 @@ def forecast(
     def advance(carry: tuple[Memory, Array], given: tuple) -> tuple[tuple[Memory, Array], Array]:
         (memory, predicted), (step, seen, action) = carry, given
         obs, reward = jnp.where(seen, step.obs, predicted[:-1]), jnp.where(seen, step.reward, predicted[-1])
-        memory, _ = perceive(model, scales, memory, step._replace(obs=obs, reward=reward), constants)
+        memory, _ = perceive(model, scales, memory, step._replace(obs=obs, reward=reward), perceived)
         after = scales.in_units(model.predict(memory.lstm.d, action))
         return (memory, after), predicted
 
     action = jnp.roll(steps.prev_action, -1, axis=0)  # a_t; the last one is not used
     obs = steps.obs.shape[-1]
-    start = no_memory(model.lstm.w_d.shape[0], obs, action.shape[-1], constants), jnp.full(obs + 1, jnp.nan)
+    start = no_memory(model.lstm.w_d.shape[0], obs, action.shape[-1], perceived), jnp.full(obs + 1, jnp.nan)
     mean = jax.lax.scan(advance, start, (steps, observed, action))[1]
     return Gaussian(mean, jnp.zeros_like(mean))

@@ -43,9 +43,9 @@ class PredictiveModel(eqx.Module):
     lstm: LSTM
     predictor: MLP
 
-    def __init__(self, obs: int, action: int, memories: int, d: int, hidden: int):
-        """Sizes of o_t, a_t, (n_t, m_t), the state of the LSTM, and the hidden layer of the predictor."""
-        self.lstm = LSTM(obs + action + 1 + memories, d)
+    def __init__(self, obs: int, action: int, inputs: int, d: int, hidden: int):
+        """Sizes of o_t, a_t, the input and the state of the LSTM, and the hidden layer of the predictor."""
+        self.lstm = LSTM(inputs, d)
         self.predictor = MLP((d + action, hidden, obs + 1), jax.nn.relu)
 
     def predict(self, d: Float[Array, " d"], action: Float[Array, " action"]) -> Float[Array, " prediction"]:
@@ -88,7 +88,7 @@ def init_model(
     key: Key[Array, ""],
     obs: int,
     action: int,
-    memories: int,
+    inputs: int,
     d: int,
     hidden: int,
     long_memories: float,
@@ -96,7 +96,7 @@ def init_model(
 ) -> PredictiveModel:
     """A new model. A fraction `long_memories` of its cells have forget biases log U(1, `longest_memory`)."""
     key_weights, key_memories = jax.random.split(key)
-    model = draw(key_weights, PredictiveModel(obs, action, memories, d, hidden))
+    model = draw(key_weights, PredictiveModel(obs, action, inputs, d, hidden))
     cells = round(long_memories * d)
     steps = jax.random.uniform(key_memories, (cells,), minval=1.0, maxval=float(longest_memory))
     bias = model.lstm.bias.at[d : d + cells].set(jnp.log(steps))  # gates i, f, g, o

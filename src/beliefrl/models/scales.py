@@ -36,12 +36,13 @@ class Scales(NamedTuple):
         return standardise(self.obs, step.obs), standardise(self.reward, step.reward[..., None])
 
     def perception(
-        self, step: Timestep, memory: Float[Array, "*batch obs constants"] | None
+        self, step: Timestep, memory: Float[Array, "*batch obs constants"] | None, with_reward: bool = True
     ) -> Float[Array, "*batch x"]:
         """x_t = (o_t, a_{t-1}, r_{t-1}, n_t), all but the action standardised, given n_t if there is one."""
         obs, reward = self.standardised(step)
+        rewards = [reward] if with_reward else []
         remembered = [] if memory is None else [standardise(self.memory, _flat(memory))]
-        return jnp.concatenate([obs, step.prev_action, reward, *remembered], axis=-1)
+        return jnp.concatenate([obs, step.prev_action, *rewards, *remembered], axis=-1)
 
     def model_input(
         self, x: Float[Array, "*batch x"], rewards: Float[Array, "*batch constants"]
