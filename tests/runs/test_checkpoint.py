@@ -80,6 +80,21 @@ def test_everything_comes_back(three):
     equal(found.timesteps, rings[30])
 
 
+@pytest.mark.parametrize("is_old", [False, True])
+def test_seeds_whose_numbers_differ_in_length_come_back(tmp_path, is_old):
+    """Text and numbers are in another order: "10" is before "9". Version 0.3.0 signed the order of the numbers."""
+    ring, checkpoints = Ring(), Checkpoints(tmp_path, keep=2)
+    progress = {"metrics": {9: 90, 10: 100}}
+    checkpoints.save(5, progress, tree(), ring.timesteps, ring.added)
+    checkpoints.close()
+    if is_old:
+        path = listed(tmp_path)[-1] / "manifest.json"
+        content = json.loads(path.read_bytes())["content"] | {"progress": progress}
+        signed = {"content": content, "sha256": checkpoint._sha256(checkpoint._canonical(content))}
+        path.write_text(json.dumps(signed))
+    assert Checkpoints(tmp_path, keep=2).restore(tree(), ring.timesteps).progress == {"metrics": {"9": 90, "10": 100}}
+
+
 def test_a_checkpoint_writes_only_what_is_new_in_the_replay(three):
     folder, _ = three
     files = sorted((folder / "checkpoints" / "replay").iterdir())

@@ -250,6 +250,7 @@ def _canonical(content: dict[str, Any]) -> bytes:
 
 
 def _signed(content: dict[str, Any]) -> bytes:
+    content = json.loads(json.dumps(content))  # all keys are text, so they have the same order when they are read
     return json.dumps({"content": content, "sha256": _sha256(_canonical(content))}, indent=1).encode()
 
 
@@ -272,13 +273,21 @@ def _content(path: pathlib.Path) -> dict[str, Any]:
     """The content of a checkpoint's manifest."""
     try:
         signed = json.loads((path / "manifest.json").read_bytes())
-        if _sha256(_canonical(signed["content"])) == signed["sha256"]:
-            return signed["content"]
+        content = signed["content"]
+        if signed["sha256"] in (_sha256(_canonical(content)), _sha256(_canonical(_until_0_3(content)))):
+            return content
     except (FileNotFoundError, ValueError, KeyError, TypeError):
         pass
     except OSError as error:
         raise arrays.unreadable(path / "manifest.json", error) from None
     raise Damaged(f"{path / 'manifest.json'} is damaged.")
+
+
+def _until_0_3(content: dict[str, Any]) -> dict[str, Any]:
+    """The content as version 0.3.0 signed it: seeds were numbers, so 9 came before 10."""
+    progress = content["progress"]
+    metrics = {int(seed): length for seed, length in progress.get("metrics", {}).items()}
+    return content | {"progress": progress | {"metrics": metrics}}
 
 
 def _check(path: pathlib.Path, size: int, sha256: str) -> None:
