@@ -12,6 +12,8 @@ import jax
 import numpy as np
 from gymnasium import spaces
 
+from beliefrl.training import lockstep
+
 BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)
 IMAGE = spaces.Box(0, 255, (64, 64, 3), np.uint8)
 
@@ -219,6 +221,34 @@ class Stuck(Fine):
         if self.time == 2 and self.action > 0:
             time.sleep(60)
         return super().step(action)
+
+
+class StuckReset(Fine):
+    """Its second reset takes a minute."""
+
+    resets = 0
+
+    def reset(self, *, seed=None, options=None):
+        self.resets += 1
+        if self.resets == 2:
+            time.sleep(60)
+        return super().reset(seed=seed, options=options)
+
+
+class StuckClose(Fine):
+    """It takes a minute to close it."""
+
+    def close(self):
+        time.sleep(60)
+
+
+class Orphan(Stuck):
+    """Writes the number of its process to a file, and waits for half a second when its parent has ended."""
+
+    def __init__(self, folder):
+        super().__init__()
+        lockstep.CLOSING = 0.5
+        (pathlib.Path(folder) / str(os.getpid())).touch()
 
 
 class Closing(Fine):

@@ -333,6 +333,17 @@ def test_files_that_the_ring_has_overwritten_are_removed(tmp_path):
     equal(found.timesteps, ring.timesteps)
 
 
+def test_timesteps_whose_file_was_removed_are_written_again(tmp_path):
+    checkpoints, ring = Checkpoints(tmp_path, keep=2), Ring()
+    for step in (1, 2):
+        ring.add(1, 2)
+        saved(checkpoints, ring, step)
+        if step == 1:
+            (tmp_path / "checkpoints" / "replay" / "000001.safetensors").unlink()
+    assert restored(tmp_path).step == 2
+    equal(restored(tmp_path).timesteps, ring.timesteps)
+
+
 def test_a_damaged_older_checkpoint_does_not_prevent_saving(three):
     folder, _ = three
     listed(folder)[1].joinpath("manifest.json").write_text("{")

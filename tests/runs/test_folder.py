@@ -1,5 +1,6 @@
 """What a run's folder keeps: nothing of the user's is removed, the best agents stay, and trackers get the numbers."""
 
+import errno
 import importlib.util
 import json
 import os
@@ -100,11 +101,13 @@ def test_the_best_agent_of_each_seed_stays(tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"nonsense", arrays.packed(weights(1.0), {"evaluations": "[1, 2]"})])
-def test_a_damaged_file_of_best_agents_is_one_sentence(tmp_path, content):
+def test_a_damaged_file_of_best_agents_is_one_sentence_and_a_training_sets_it_aside(tmp_path, content):
     (tmp_path / best.BEST).write_bytes(content)
     with pytest.raises(UserError, match=r"best\.safetensors is damaged: restore it"):
-        best.save(tmp_path, weights(1.0), 10, [1.0, 1.0])
-    assert (tmp_path / best.BEST).read_bytes() == content
+        best.evaluations(tmp_path, 2)
+    best.save(tmp_path, weights(1.0), 10, [1.0, 1.0])
+    assert (tmp_path / f"damaged-{best.BEST}").read_bytes() == content
+    assert best.evaluations(tmp_path, 2) == [{"step": 10, "return": 1.0}] * 2
 
 
 def test_a_run_of_an_older_version_has_no_best_agent(tmp_path):
@@ -282,3 +285,13 @@ def test_weights_and_biases_is_kept_offline_in_the_runs_folder(tmp_path):
     assert all(b"evaluation/sampled" in content for content in contents)
     assert all(len(content) > 100 for content in contents)
     assert not (tmp_path / "wandb").exists()
+
+
+def test_a_file_system_without_locks_is_no_error(tmp_path, monkeypatch):
+    fcntl = pytest.importorskip("fcntl")
+
+    def flock(file, how):
+        raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    locked(tmp_path, "is being trained").close()

@@ -1,6 +1,11 @@
 """Several environments for one agent: recording, resets, updates, both loops; and one that does not answer."""
 
+import os
+import pathlib
 import re
+import signal
+import subprocess
+import sys
 import threading
 import time
 
@@ -20,7 +25,7 @@ from beliefrl.types import StoredTimestep, Timestep, WindowShape, transitions
 from training.test_host_loop import Hanging, Wrapped
 from training.test_resume import AGENT, OPTIONS, Crash, crash_at, files
 from worlds import SHARED, Counting, CountingAgent, ReadingAgent, leaves, trained
-from wrong import Fine, Sleeping, Stuck, raising
+from wrong import Fine, Sleeping, Stuck, StuckClose, StuckReset, raising
 
 ENVS = 3  # with the agent's cycles of 4 steps, a round has 12
 
@@ -223,13 +228,63 @@ def test_a_step_that_takes_too_long_is_a_fault_and_names_the_seed():
     actions = np.array([[-1.0], [1.0]], np.float32)
     lanes.step(actions)
     lanes.step(actions)
-    message = "robot (step 3): the step of seed 1 has not returned after 3 s, the step_timeout: "
+    message = "robot (step 3): the step of seed 1 has not returned after 3 s: fix it, or allow more time with "
     began = time.monotonic()
     with pytest.raises(Fault, match=f"^{re.escape(message)}"):
         lanes.step(actions)
     lanes.close()
     assert time.monotonic() - began < 30
     assert not any(process.is_alive() for process in lanes._envs.processes)
+
+
+def test_a_reset_that_takes_too_long_is_a_fault_where_steps_have_a_limit(monkeypatch):
+    monkeypatch.setattr(lockstep, "RESET", 3.0)
+    lanes = Lockstep(GymnasiumTask(StuckReset, "robot"), ["seed 0"], "always", timeout=0.1)
+    lanes.reset(np.array([0]))
+    with pytest.raises(Fault, match=r"the reset of seed 0 has not returned after 3 s: fix it, or allow more time"):
+        lanes.restart(np.array([True]))
+    lanes.close()
+    assert not any(process.is_alive() for process in lanes._envs.processes)
+
+
+def test_environments_that_do_not_close_are_killed(monkeypatch):
+    monkeypatch.setattr(lockstep, "CLOSING", 0.5)
+    lanes = Lockstep(GymnasiumTask(StuckClose, "robot"), ["seed 0", "seed 1"], "always")
+    lanes.reset(np.array([0, 1]))
+    lanes.close()
+    assert [process.exitcode for process in lanes._envs.processes] == [-signal.SIGKILL] * 2
+
+
+ORPHAN = """
+import os, sys, threading
+import numpy as np
+from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.training.lockstep import Lockstep
+from wrong import Orphan
+
+if __name__ == "__main__":
+    lanes = Lockstep(GymnasiumTask(Orphan, "robot", {"folder": sys.argv[1]}), ["seed 0"], "always")
+    lanes.reset(np.array([0]))
+    threading.Timer(1.0, os._exit, [0]).start()
+    for _ in range(3):
+        lanes.step(np.ones((1, 1), np.float32))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="it looks into /proc")
+def test_an_environment_that_hangs_does_not_outlive_the_training(tmp_path):
+    script, folder = tmp_path / "script.py", tmp_path / "numbers"
+    folder.mkdir()
+    script.write_text(ORPHAN)
+    path = {"PYTHONPATH": os.pathsep.join(sys.path)}
+    assert subprocess.run([sys.executable, script, folder], env=os.environ | path, timeout=60).returncode == 0
+    numbers = [each.name for each in folder.iterdir()]
+    assert numbers
+    for _ in range(100):
+        if not any(pathlib.Path("/proc", number).exists() for number in numbers):
+            return
+        time.sleep(0.1)
+    pytest.fail("a process is still there")
 
 
 def test_a_seed_that_has_diverged_does_not_stop_the_environments_of_the_others():

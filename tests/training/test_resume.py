@@ -1,5 +1,6 @@
 """A training that is stopped, killed or extended goes on, on a CPU to the last bit; what cannot go on says why."""
 
+import errno
 import json
 import os
 import shutil
@@ -16,10 +17,12 @@ from beliefrl.analysis.groups import groups, is_finished
 from beliefrl.cli import main
 from beliefrl.runs.arrays import load as load_arrays
 from beliefrl.runs.arrays import packed
-from beliefrl.runs.checkpoint import _sha256, _signed, listed
+from beliefrl.runs.best import evaluations
+from beliefrl.runs.checkpoint import Checkpoints, _sha256, _signed, listed
 from beliefrl.runs.run import Recorder, Run
 from beliefrl.tasks import make
 from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.training.schedule import Phase
 from beliefrl.training.stop import Stopped
 from beliefrl.types import UserError
 from worlds import saved
@@ -134,7 +137,7 @@ def test_a_training_that_was_killed_before_its_first_checkpoint_begins_again(who
         main([*lines[command].split(), str(folder)])
     assert files(folder) == files(whole[0])
     is_resumed = left != "no config" and command != "train"
-    assert ("no checkpoint was written: begins again from step 0" in capsys.readouterr().out) == is_resumed
+    assert ("there is no checkpoint: begins again from step 0" in capsys.readouterr().out) == is_resumed
     assert len(Run(folder).config.get("resumed", ())) == is_resumed
 
 
@@ -279,7 +282,7 @@ def test_a_run_that_is_being_trained_is_not_touched(whole):
     folder, _ = whole
     recorder = Recorder(folder, None)
     try:
-        with pytest.raises(UserError, match=f"is being trained by process {os.getpid()}: stop it"):
+        with pytest.raises(UserError, match=f"is being trained by process {os.getpid()} on .+: stop it"):
             resume(folder)
     finally:
         recorder.close()
@@ -515,3 +518,75 @@ def test_evaluate_says_of_which_seed_the_agent_is_older(tmp_path, capsys):
     out = capsys.readouterr().out
     assert "seed 5 diverged by step 1,500: its agent is from an evaluation before that" in out
     assert "seed 4 diverged" not in out
+
+
+def test_a_training_whose_checkpoints_are_gone_begins_again_and_keeps_what_it_had(tmp_path):
+    folder = tmp_path / "run"
+    with pytest.raises(Crash):
+        train(AGENT, "pendulum-v", folder, crash_after_evaluation(), **OPTIONS)
+    before = {path.name: path.read_bytes() for path in (*(folder / "metrics").iterdir(), folder / "best.safetensors")}
+    shutil.rmtree(folder / "checkpoints")
+    notes = []
+    run = resume(folder, callback=lambda event: event.note and notes.append(event.note))
+    assert any(f"the log and the agents until now are in {folder / 'before-1'}" in note for note in notes)
+    aside = {path.name: path.read_bytes() for path in (folder / "before-1").rglob("*") if path.is_file()}
+    assert before.items() <= aside.items()
+    assert [row["step"] for row in run.rows(0, "evaluation")] == [120, 240]
+
+
+def crash_after_evaluation():
+    """A report that crashes after the first evaluation."""
+
+    def report(event):
+        if event.evaluation is not None:
+            raise Crash
+
+    return report
+
+
+def test_a_signal_before_an_evaluation_is_not_kept_waiting_and_the_results_so_far_are_written(tmp_path):
+    def signals(event):
+        if event.step > 200 and event.phase is Phase.EVALUATING:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    settings = OPTIONS | {"steps": 239, "eval_every": 120, "checkpoint_steps": 1000}
+    with pytest.raises(Stopped, match="stopped at step 2"):
+        train(AGENT, "pendulum-v", tmp_path / "run", **settings, callback=signals)
+    run = Run(tmp_path / "run")
+    assert [row["step"] for row in run.rows(0, "evaluation")] == [120]
+    assert run.results()["step"] == 120
+    assert [row["step"] for row in resume(run).rows(0, "evaluation")][-1] > 200
+
+
+def test_a_checkpoint_that_could_not_be_written_is_followed_by_another(tmp_path, monkeypatch):
+    fails, write = [True], Checkpoints._write
+
+    def once(self, step, *rest):
+        if step == 120 and fails.pop():
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        write(self, step, *rest)
+
+    monkeypatch.setattr(Checkpoints, "_write", once)
+    notes = []
+    train(
+        AGENT, "pendulum-v", tmp_path / "run", **OPTIONS, callback=lambda event: event.note and notes.append(event.note)
+    )
+    assert any("a checkpoint could not be written (No space left on device)" in note for note in notes)
+    assert listed(tmp_path / "run")[-1].name.endswith("-step-240")
+
+
+def test_a_damaged_best_agent_does_not_end_the_training(tmp_path):
+    with pytest.raises(Crash):
+        train(AGENT, "pendulum-v", tmp_path / "run", crash_after_evaluation(), **OPTIONS)
+    (tmp_path / "run" / "best.safetensors").write_bytes(b"half")
+    run = resume(tmp_path / "run")
+    assert (tmp_path / "run" / "damaged-best.safetensors").read_bytes() == b"half"
+    assert None not in evaluations(run.folder, 2)
+
+
+def test_a_training_goes_on_with_other_options_of_its_recording(tmp_path):
+    with pytest.raises(Crash):
+        train(AGENT, "pendulum-v", tmp_path / "run", crash_after_evaluation(), **OPTIONS)
+    run = train(AGENT, "pendulum-v", tmp_path / "run", **OPTIONS | {"keep_checkpoints": 1, "track": ()}, resume=True)
+    assert len(listed(run.folder)) == 1
+    assert run.options.track == ()

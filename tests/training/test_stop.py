@@ -56,6 +56,18 @@ def test_a_handler_that_an_environment_has_installed_is_replaced():
         assert requests.number == signal.SIGTERM
 
 
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="this system has no SIGHUP")
+@pytest.mark.parametrize("is_ignored", [False, True])
+def test_a_closed_terminal_is_a_request_but_not_after_nohup(is_ignored):
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN if is_ignored else signal.SIG_DFL)
+    try:
+        with stop.Requests() as requests:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert requests.number == (None if is_ignored else signal.SIGHUP)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
 ANSWERING = """
 import hashlib, os, signal
 from beliefrl.training.stop import Requests
@@ -83,11 +95,26 @@ def test_signals_that_come_together_are_one_request():
                 process.send_signal(signal.SIGTERM)
                 time.sleep(0.02)
             time.sleep(0.5)
+            process.send_signal(signal.SIGTERM)  # of a sweep, after that of a scheduler
+            time.sleep(0.5)
             assert process.poll() is None
-            process.send_signal(signal.SIGTERM)
-            assert process.wait(timeout=20) == 143
+            process.send_signal(signal.SIGINT)
+            assert process.wait(timeout=20) == 130
         finally:
             process.kill()
+
+
+@pytest.mark.parametrize(
+    ("number", "seconds", "is_another"),
+    [
+        (signal.SIGINT, 0.1, False),
+        (signal.SIGINT, 1.0, True),
+        (signal.SIGTERM, 10.0, False),
+        (signal.SIGTERM, 31.0, True),
+    ],
+)
+def test_a_second_signal_is_a_request_of_its_own_after_some_time(number, seconds, is_another):
+    assert stop._is_another(number, seconds) == is_another
 
 
 TRAINING = """

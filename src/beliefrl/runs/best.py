@@ -42,16 +42,21 @@ def save(folder: pathlib.Path, agents: Any, step: int, returns: Sequence[float])
         step: the step of the evaluation.
         returns: the mean return of each seed, NaN for one that has diverged.
 
-    Raises:
-        Damaged: the file cannot be read.
+    A damaged file is moved to damaged-best.safetensors.
     """
-    path, found = folder / BEST, evaluations(folder, len(returns))
+    path = folder / BEST
+    try:
+        found = evaluations(folder, len(returns))
+        saved = arrays.load(path) if path.exists() else None
+    except arrays.Damaged:
+        path.replace(folder / f"damaged-{BEST}")
+        found, saved = [None] * len(returns), None
     pairs = enumerate(zip(returns, found, strict=True))
     better = [index for index, (new, old) in pairs if np.isfinite(new) and (old is None or new > old["return"])]
     if not better:
         return
     new = arrays.copied(agents)
-    saved = arrays.load(path) if path.exists() else new
+    saved = saved or new
     for name, array in new.items():
         saved[name][better] = array[better]
     for index in better:

@@ -71,6 +71,8 @@ class Checkpoints:
             OSError: the previous checkpoint could not be written.
         """
         self.wait()
+        if not all(self._is_there(segment) for segment in self._segments):  # someone has removed files
+            self._segments = []
         state, new = arrays.copied(tree), segments.new(timesteps, added, self._segments)
         self._writing = self._thread.submit(self._write, step, progress, state, new)
 
@@ -124,6 +126,10 @@ class Checkpoints:
         self._thread.shutdown()
 
     # Writing
+
+    def _is_there(self, segment: Segment) -> bool:
+        path = self.folder / "replay" / segment.file
+        return path.exists() and path.stat().st_size == segment.size
 
     def _write(self, step: int, progress: dict[str, Any], state: dict[str, np.ndarray], new: New) -> None:
         replay = self.folder / "replay"

@@ -1,9 +1,11 @@
 """The folder of a run: making it, locking it against other processes, and clearing it if nothing was saved."""
 
 import contextlib
+import errno
 import json
 import os
 import pathlib
+import platform
 import re
 import shutil
 from typing import Any
@@ -57,6 +59,24 @@ def clear(folder: pathlib.Path) -> None:
                 path.unlink()
 
 
+def set_aside(folder: pathlib.Path) -> pathlib.Path | None:
+    """Move the logs and agents of a training that begins again to before-1, before-2, ....
+
+    Returns None, and moves nothing, if no agent was saved.
+    """
+    if not (folder / "agent.safetensors").exists():
+        return None
+    number = 1
+    while (aside := folder / f"before-{number}").exists():
+        number += 1
+    aside.mkdir()
+    for name in ("metrics", "best.safetensors", "agent.safetensors"):  # the last one says that there is more to move
+        if (folder / name).exists():
+            (folder / name).rename(aside / name)
+    (folder / "metrics").mkdir()
+    return aside
+
+
 def write_config(folder: pathlib.Path, config: dict[str, Any]) -> None:
     """Write config.json atomically."""
     write_whole(folder / "config.json", (json.dumps(plain(config), indent=2) + "\n").encode())
@@ -64,6 +84,8 @@ def write_config(folder: pathlib.Path, config: dict[str, Any]) -> None:
 
 def locked(folder: pathlib.Path, doing: str) -> Any:
     """An open file that no other process can lock. The system unlocks it when this process ends.
+
+    On Windows, and on a file system without locks, nothing is locked.
 
     Raises:
         UserError: the folder cannot be written, or another process has locked it.
@@ -78,14 +100,16 @@ def locked(folder: pathlib.Path, doing: str) -> Any:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except ImportError:  # this system has no fcntl
         return file
-    except OSError:
+    except OSError as error:
+        if error.errno not in (errno.EAGAIN, errno.EWOULDBLOCK, errno.EACCES):  # a file system without locks
+            return file
         file.seek(0)
         who = file.read().strip() or "another"
         file.close()
         raise UserError(f"{folder} {doing} by process {who}: stop it, or wait until it has ended.") from None
     try:
         file.truncate(0)
-        file.write(str(os.getpid()))
+        file.write(f"{os.getpid()} on {platform.node()}")
         file.flush()
     except OSError as error:
         with contextlib.suppress(OSError):

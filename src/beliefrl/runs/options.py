@@ -55,7 +55,8 @@ class Options:
     must guard its main code with `if __name__ == "__main__":`."""
     step_timeout: float | None = None
     """Maximum number of seconds of one step of a Gymnasium environment. If a step takes longer, the training is saved
-    and ends with an error. Each environment then has a process of its own. None: no limit."""
+    and ends with an error. A reset may take a minute, or this long if it is more. Each environment then has a process
+    of its own. None: no limit."""
     checkpoint_steps: int = 2_000
     """Environment steps between two checkpoints. 0: no checkpoints by steps."""
     checkpoint_minutes: float = 10.0

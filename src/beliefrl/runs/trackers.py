@@ -42,7 +42,7 @@ class TensorBoard:
 
         path = folder / "tensorboard" / f"seed-{seed}"
         shutil.rmtree(path, ignore_errors=True)
-        path.mkdir(parents=True)
+        path.mkdir(parents=True, exist_ok=True)  # a network file system may keep open files
         self._writer, self._event, self._scalar = EventsWriter(str(path / "events")), Event, scalar
 
     def log(self, step: int, values: dict[str, float]) -> None:

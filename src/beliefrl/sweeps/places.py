@@ -97,7 +97,8 @@ def environment(sweep: pathlib.Path, slot: Slot) -> dict[str, str]:
 def slots(workers: int | None = None) -> list[Slot]:
     """The slots of this machine: its GPUs if it has any, otherwise its cores.
 
-    With `workers` there are that many slots, except that each GPU has at most one.
+    With `workers` there are that many slots, except that each GPU has at most one. Trainings are bound to cores only if
+    there is one for each core: another sweep may use the others, and would be bound to the same ones.
     """
     gpus = _gpus()
     if gpus:
@@ -108,7 +109,7 @@ def slots(workers: int | None = None) -> list[Slot]:
         cores = [str(core) for core in sorted(os.sched_getaffinity(0))]
     else:
         cores = ["any"] * (os.cpu_count() or 1)
-    return cores[:workers] if workers is None or workers <= len(cores) else cores + ["any"] * (workers - len(cores))
+    return cores if workers in (None, len(cores)) else ["any"] * (workers or 0)
 
 
 def _gpus() -> int:

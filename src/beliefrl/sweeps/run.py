@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import os
 import pathlib
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol, runtime_checkable
@@ -23,7 +24,7 @@ from beliefrl.training.stop import Requests, Stopped
 from beliefrl.types import UserError, cause, check_whole, one_line, plain, short
 
 LOOK_EVERY = 0.5  # seconds
-HARMLESS = ("seed", "seeds", "processes", "checkpoint_steps", "checkpoint_minutes", "keep_checkpoints", "track")
+OF_A_RUN = ("seed", "seeds")  # the plan divides the seeds into runs
 ALL = 10_000  # seeds in one run, more than any experiment has
 
 
@@ -86,7 +87,7 @@ def sweep(
             trainings = plans.extended(before, experiments, together)
             _check_options(folder, trainings)
             status = _status(folder, trainings)
-            with reporting(folder, report, progress) as listen, Requests() as requests:
+            with reporting(folder, report, progress) as listen, Requests(confirm) as requests:
                 _loop(folder, status, launcher, listen, requests)
         finally:
             launcher.stop()  # also closes the connection to a Ray cluster
@@ -97,6 +98,12 @@ def sweep(
             f"cause and run the command again; {folder}/logs has the output of each."
         )
     return status
+
+
+def confirm() -> None:
+    """Answer a signal: it can take minutes until every training has stopped."""
+    stops = "stopping: every training finishes its block of steps and writes a checkpoint; Ctrl-C again ends at once"
+    print(f"beliefrl: {stops}", file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager
@@ -129,7 +136,7 @@ def _check_options(folder: pathlib.Path, trainings: Sequence[Training]) -> None:
             continue
         there = dataclasses.asdict(Options()) | run.config["options"]
         for name, value in dataclasses.asdict(plans.options_of(training)).items():
-            if name not in (*CHANGEABLE, *HARMLESS) and plain(there[name]) != plain(value):
+            if name not in (*CHANGEABLE, *OF_A_RUN) and plain(there[name]) != plain(value):
                 raise UserError(
                     f"{run.folder} was trained with {name}={there[name]}, not {value}: give that value, or choose "
                     "another --out, in Python out=."

@@ -26,7 +26,7 @@ from beliefrl.sweeps import places, ranges, study
 from beliefrl.sweeps.experiments import Experiment
 from beliefrl.sweeps.plan import Training
 from beliefrl.sweeps.progress import SweepStatus
-from beliefrl.sweeps.run import lock, reason, reporting
+from beliefrl.sweeps.run import confirm, lock, reason, reporting
 from beliefrl.sweeps.study import Actions, Objective, Search, Trial
 from beliefrl.training.stop import Requests, Stopped
 from beliefrl.types import UserError, cause, check_whole, short
@@ -124,7 +124,7 @@ def _run(folder: pathlib.Path, search: Search, trials: int, prune: bool, workers
         stopped = study.running(recorded)
         status = _status(recorded, search.base, trials)
         launcher = places.Local(folder, places.slots(workers))
-        with reporting(folder, None, progress) as listen, Requests() as requests:
+        with reporting(folder, None, progress) as listen, Requests(confirm) as requests:
             try:
                 loop = _Loop(folder, recorded, search, launcher, status, stopped)
                 while status.waiting or status.running:

@@ -11,7 +11,8 @@ from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.schedule import Options
 from beliefrl.types import UserError, plain, short
 
-CHANGEABLE = ("steps", "stop_at", "stop_patience", "step_timeout")  # options that may differ when a training continues
+RECORDING = ("processes", "checkpoint_steps", "checkpoint_minutes", "keep_checkpoints", "track")
+CHANGEABLE = ("steps", "stop_at", "stop_patience", "step_timeout", *RECORDING)  # may differ when a training continues
 
 
 def patience(options: Options) -> None:

@@ -31,6 +31,8 @@ from beliefrl.types import UserError
 
 HANDOVER = 5e-4  # approximate seconds for passing a step to other processes
 SLOW = 60.0  # seconds after which a call that has not returned is reported
+RESET = 60.0  # seconds that a reset may take, if steps have a limit
+CLOSING = 60.0  # seconds that processes have to close their environments
 
 
 class StepResults(NamedTuple):
@@ -48,6 +50,7 @@ class _Call(NamedTuple):
 
     name: str
     began: float
+    limit: float | None  # seconds that it may take
 
 
 class Lockstep:
@@ -69,8 +72,8 @@ class Lockstep:
             processes: "always" gives each a process of its own, "never" none, "auto" decides by a measurement.
                 Each process imports the main module of this one: guard it by `if __name__ == "__main__":`.
             notify: called from another thread with a sentence if making, a reset or a step takes longer than SLOW.
-            timeout: maximum seconds of a step; a longer step raises a Fault. Environments in this process have no
-                limit, because nothing can interrupt them.
+            timeout: maximum seconds of a step; a longer step raises a Fault. A reset has at least RESET.
+                Environments in this process have no limit, because nothing can interrupt them.
 
         Raises:
             UserError: the environment cannot be made, or is not supported.
@@ -108,17 +111,16 @@ class Lockstep:
 
     def reset(self, seeds: Int[np.ndarray, " lane"]) -> Any:
         """Begin an episode in every environment; returns the observations, (lane, obs)."""
-        with self._calling("reset"):
-            return self._envs.reset(seed=[int(seed) for seed in seeds])[0]
+        return self._reset(seed=[int(seed) for seed in seeds])
 
     def step(self, actions: Float[np.ndarray, "lane action"]) -> StepResults:
         """Step every environment. Actions that are not finite, of seeds that have diverged, become zeros."""
         self.steps += 1
         actions = np.where(np.isfinite(actions), actions, np.float32(0))
-        with self._calling("step"):
+        with self._calling("step", self.timeout) as call:
             if self.apart:
                 self._envs.step_async(actions)
-                obs, reward, terminated, truncated, info = self._envs.step_wait(self.timeout)
+                obs, reward, terminated, truncated, info = self._envs.step_wait(call.limit)
             else:
                 obs, reward, terminated, truncated, info = self._envs.step(actions)
         measures = {name: np.asarray(info[name], np.float32) for name in self.task.spec.measures}
@@ -126,32 +128,48 @@ class Lockstep:
 
     def restart(self, done: Bool[np.ndarray, " lane"]) -> Any:
         """Begin an episode where `done`; returns the observations of all environments, (lane, obs)."""
-        with self._calling("reset"):
-            return self._envs.reset(options={"reset_mask": done})[0]
+        return self._reset(options={"reset_mask": done})
+
+    def _reset(self, **how: Any) -> Any:
+        with self._calling("reset", self.timeout and max(RESET, self.timeout)) as call:
+            if not self.apart:
+                return self._envs.reset(**how)[0]
+            self._envs.reset_async(**how)
+            return self._envs.reset_wait(call.limit)[0]
 
     def close(self) -> None:
         """Close all environments; errors while closing are ignored."""
         self._closed.set()
         atexit.unregister(self.close)
-        if self.apart and self._call is not None:  # a regular close would wait for the step to end
-            for process in self._envs.processes:
-                process.kill()  # they ignore milder signals
-                process.join()
-            self._envs.closed = True
+        if self.apart and not self._envs.closed:
+            self._close_processes(0.0 if self._call is not None else CLOSING)  # a call may never return
         with contextlib.suppress(Exception):
             self._envs.close()
 
+    def _close_processes(self, seconds: float) -> None:
+        """Ask all processes to close their environments and end. Kill those that have not ended after `seconds`."""
+        for pipe in self._envs.parent_pipes:
+            with contextlib.suppress(OSError):  # its process has ended
+                pipe.send(("close", None))
+        until = time.monotonic() + seconds
+        for process in self._envs.processes:
+            process.join(max(0.0, until - time.monotonic()))
+            if process.is_alive():
+                process.kill()  # they ignore milder signals
+                process.join()
+        self._envs.closed = True
+
     @contextlib.contextmanager
-    def _calling(self, name: str) -> Iterator[None]:
+    def _calling(self, name: str, limit: float | None = None) -> Iterator["_Call"]:
         """Record the current call. Raises a Fault if the process of a lane dies during the call, or takes too long."""
-        self._call = _Call(name, time.monotonic())
+        self._call = call = _Call(name, time.monotonic(), limit)
         try:
             with _silence():
-                yield
+                yield call
         except (EOFError, ConnectionError):
             raise Fault(self._death()) from None
         except multiprocessing.TimeoutError:
-            raise Fault(self._delay()) from None
+            raise Fault(self._delay(call)) from None
         except Exception:  # the call has returned, with an error of an environment
             self._call = None
             jax.config.update("jax_enable_x64", self._is_wide)
@@ -176,13 +194,11 @@ class Lockstep:
             with contextlib.suppress(Exception):  # an error of the listener must not end the watch
                 notify(f"{self.task.name}{at}: {call.name} has not returned for {SLOW:.0f} s: it is slow, or it hangs.")
 
-    def _delay(self) -> str:
+    def _delay(self, call: "_Call") -> str:
         late = [lane for lane, pipe in zip(self.lanes, self._envs.parent_pipes, strict=True) if not pipe.poll(0)]
         who = " and ".join(late) or "one of them"
-        return (
-            f"{self.task.name} (step {self.steps}): the step of {who} has not returned after {self.timeout:g} s, the "
-            "step_timeout: fix the environment, or allow more time."
-        )
+        late_call = f"{self.task.name} (step {self.steps}): the {call.name} of {who}"
+        return f"{late_call} has not returned after {call.limit:g} s: fix it, or allow more time with step_timeout."
 
     def _death(self) -> str:
         dead = []
@@ -195,6 +211,15 @@ class Lockstep:
         killed = any(process.exitcode is not None and process.exitcode < 0 for process in processes)
         why = ", killed or out of memory" if killed or not dead else ""
         return f"{self.task.name} (step {self.steps}): the process of {who} has ended{why}."
+
+
+def _end_with_parent() -> None:
+    """End this process if its parent has ended and the environment, which hangs, has not been closed."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        time.sleep(CLOSING)
+        os._exit(1)
 
 
 def _go_on(number: int, frame: Any) -> None:
@@ -211,6 +236,7 @@ class _Factory:
     def __call__(self) -> Any:
         if os.getpid() == self.process:
             return self.task.environment(self.lane)
+        threading.Thread(target=_end_with_parent, daemon=True).start()
         for number in SIGNALS:  # sent to all processes of a job: the training saves, then ends these
             signal.signal(number, _go_on)  # not SIG_IGN, which a program that the environment starts would inherit
         try:

@@ -158,7 +158,7 @@ def _stages(
         at, seeds = yield from _learn(agent, program, options, at, seeds)
     last = None
     if at.evaluated < at.step:
-        yield from _evaluation(agent, program, seeds, at.step, Phase.LEARNING)
+        yield from _evaluation(agent, program, at, seeds, Phase.LEARNING)
         last = Snapshot(at._replace(evaluated=at.step), seeds)
     yield Event(Phase.FINISHED, at.step, snapshot=last)
 
@@ -221,7 +221,7 @@ def _evaluate(
 ) -> Generator[Event, None, TrainingProgress]:
     """Evaluate if an evaluation is due. Then the training can stop."""
     if _is_due(options, at):
-        yield from _evaluation(agent, program, seeds, at.step, then)
+        yield from _evaluation(agent, program, at, seeds, then)
         at = at._replace(evaluated=at.step)
     yield Event(then, at.step, snapshot=Snapshot(at, seeds))
     return at
@@ -275,8 +275,9 @@ def _until(step: int, every: int) -> int:
     return every - step % every
 
 
-def _evaluation(agent: Agent, program: Program, seeds: SeedState, step: int, then: Phase) -> Iterator[Event]:
-    yield Event(Phase.EVALUATING, step)
+def _evaluation(agent: Agent, program: Program, at: TrainingProgress, seeds: SeedState, then: Phase) -> Iterator[Event]:
+    step = at.step
+    yield Event(Phase.EVALUATING, step, snapshot=Snapshot(at, seeds))
     of_step = jax.vmap(lambda key: keys.step_key(key, jnp.asarray(step), keys.EVALUATE))
     try:
         result = program.evaluate(agent.networks(seeds.state), of_step(seeds.key))

@@ -19,6 +19,7 @@ import numpy as np
 from beliefrl.agents import Agent
 from beliefrl.analysis.figures import draw_curve
 from beliefrl.runs.checkpoint import Checkpoints
+from beliefrl.runs.folder import set_aside
 from beliefrl.runs.options import Options
 from beliefrl.runs.run import Recorder, Run
 from beliefrl.tasks.gymnasium import GymnasiumTask
@@ -90,20 +91,30 @@ class Session:
             start = initial_arrays if self.given else None
             settings = self.agent, self.task, self.options, restore, self._note, self.own_process, start
             events = stages(*settings, self.recorder.config.get("initial", {}).get("timesteps", 0))
-            with self.checkpoints, self.requests, contextlib.closing(events):
-                for event in events:
-                    if self.was_finished or self._listen(event):
-                        break
-            if self.results:
-                self.recorder.finish(self.results)
-                draw_curve(self.recorder)
+            try:
+                with self.checkpoints, self.requests, contextlib.closing(events):
+                    for event in events:
+                        if self.was_finished or self._listen(event):
+                            break
+            except Stopped:
+                self._finish()
+                raise
+            self._finish()
         finally:
             self.recorder.note_end()
 
+    def _finish(self) -> None:
+        """Write the results of the last evaluation, if there is one, and draw the curve."""
+        if self.results:
+            self.recorder.finish(self.results)
+            draw_curve(self.recorder)
+
     def begin_again(self) -> None:
-        """Clear the log and begin at step 0, because there is no checkpoint."""
+        """Clear the log and begin at step 0, because there is no checkpoint. What was learned is set aside."""
+        aside = set_aside(self.recorder.folder)
         self.recorder.rewind(dict.fromkeys(self.recorder.seeds, 0))
-        self._note("no checkpoint was written: begins again from step 0")
+        kept = "" if aside is None else f"; the log and the agents until now are in {aside}"
+        self._note(f"there is no checkpoint: begins again from step 0{kept}")
 
     def restore(self, shapes: SeedState) -> Snapshot:
         """Restore the last undamaged checkpoint, and truncate the log to its length at that time."""
@@ -195,7 +206,9 @@ class Session:
             self._report(Event(event.phase, event.step, note=note))
 
     def _is_due(self, event: Event, snapshot: Snapshot) -> bool:
-        """Whether a checkpoint is due."""
+        """Whether a checkpoint is due. Before an evaluation it is due only if a signal asks for a stop."""
+        if event.phase is Phase.EVALUATING:
+            return self.requests.number is not None
         progress, options = snapshot.progress, self.options
         steps = progress.step - self.last.step >= options.checkpoint_steps > 0
         minutes = time.monotonic() - self.saved_at >= 60 * options.checkpoint_minutes > 0
@@ -246,5 +259,17 @@ class Session:
         lost = sorted(self.lost)
         progress = {"progress": list(snapshot.progress), "metrics": self.recorder.lengths(), "lost": lost}
         progress["results"] = self.results
+        failed = self._wait()
         self.checkpoints.save(snapshot.progress.step, progress, rest, replay.timesteps, np.asarray(replay.added))
+        if failed:
+            self.checkpoints.wait()  # a second failure ends the training
         self.last, self.saved_at = snapshot.progress, time.monotonic()
+
+    def _wait(self) -> bool:
+        """Wait until the last checkpoint is written; returns whether that has failed, for example on a full disk."""
+        try:
+            self.checkpoints.wait()
+        except OSError as error:
+            self._note(f"a checkpoint could not be written ({cause(error)}): the next one is written now")
+            return True
+        return False

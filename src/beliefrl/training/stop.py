@@ -1,4 +1,7 @@
-"""Ctrl-C and SIGTERM: the first asks a training to stop, the second ends the program at once.
+"""Ctrl-C, SIGTERM and SIGHUP: the first asks a training to stop, a second Ctrl-C ends the program at once.
+
+The other signals do so only after a while: schedulers and sweeps may send one each. SIGHUP comes when the terminal is
+closed. After `nohup` it is ignored.
 
 If a program does not catch `Stopped`, it ends with the sentence and the exit code of `Stopped`, without a traceback.
 """
@@ -14,15 +17,16 @@ from collections.abc import Callable, Iterator
 from types import FrameType, TracebackType
 from typing import Any
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 ONE_REQUEST = 0.3  # seconds in which several signals count as one, because a dying parent may send one per thread
+PATIENCE = 30.0  # the same for the other signals, because a scheduler and a sweep may both send one
 
 
 class Stopped(KeyboardInterrupt):
     """A training was stopped by a signal. The message says how to continue it.
 
-    If it is not caught, a script ends with this sentence and `exit_code`: 130 for Ctrl-C, 143 for SIGTERM. In an
-    interactive session or a notebook the sentence is shown, and the session continues.
+    If it is not caught, a script ends with this sentence and `exit_code`: 130 for Ctrl-C, 143 for SIGTERM, 129 for
+    SIGHUP. In an interactive session or a notebook the sentence is shown, and the session continues.
     """
 
     def __init__(self, message: str, number: int):
@@ -32,6 +36,11 @@ class Stopped(KeyboardInterrupt):
     def _render_traceback_(self) -> list[str]:
         """The lines that IPython shows in place of a traceback."""
         return [f"beliefrl: {self}"]
+
+
+def _is_another(number: int, since: float) -> bool:
+    """Whether a signal that comes so many seconds after the first is a request of its own."""
+    return since > (ONE_REQUEST if number == signal.SIGINT else PATIENCE)
 
 
 class Waiting:
@@ -45,7 +54,7 @@ class Waiting:
     def __call__(self, number: int, frame: FrameType | None) -> None:
         if self.received is None:
             self.received = time.monotonic()
-        elif time.monotonic() - self.received > ONE_REQUEST:
+        elif _is_another(number, time.monotonic() - self.received):
             os._exit(128 + number)
 
 
@@ -66,14 +75,15 @@ def waiting() -> Iterator[None]:
 
 
 class Requests:
-    """Inside the `with` block, the first signal is stored in `number`. A later one ends the program at once.
+    """Inside the `with` block, the first signal is stored in `number`. A later Ctrl-C ends the program at once, and so
+    does another signal that comes PATIENCE seconds after the first.
 
     In an interactive session a later signal raises Stopped as soon as a compiled function returns, so the variables of
     the session are not lost. A Stopped that nobody catches is shown without a traceback.
 
     Python runs handlers between two of its own instructions, so a signal during a compiled function waits until the
     function returns. Therefore the system also writes each signal to a socket at once. A thread reads the socket. It
-    confirms the first signal and ends the program at the second.
+    confirms the first signal and ends the program at the next request.
     """
 
     def __init__(self, confirm: Callable[[], None] = lambda: None):
@@ -96,7 +106,8 @@ class Requests:
         threading.Thread(target=self._watch, args=(self._ours, first), daemon=True).start()
         self._fd = signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
         for number in SIGNALS:
-            self._before[number] = signal.signal(number, self._handle)
+            if number in (signal.SIGINT, signal.SIGTERM) or signal.getsignal(number) != signal.SIG_IGN:  # by `nohup`
+                self._before[number] = signal.signal(number, self._handle)
         return self
 
     def renew(self) -> None:
@@ -120,7 +131,7 @@ class Requests:
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self.number is None:
             self.number, self._heard = number, time.monotonic()
-        elif is_interactive() and time.monotonic() - self._heard > ONE_REQUEST:
+        elif is_interactive() and _is_another(number, time.monotonic() - self._heard):
             raise Stopped("stopped at once; what was logged and saved stays in the run's folder.", number)
 
     def _watch(self, ours: socket.socket, first: float | None) -> None:
@@ -132,7 +143,7 @@ class Requests:
                         first = now
                         with contextlib.suppress(Exception):  # an error of `confirm` must not stop the thread
                             self._confirm()
-                    elif now - first > ONE_REQUEST and not is_interactive():
+                    elif _is_another(received[0], now - first) and not is_interactive():
                         os._exit(128 + received[0])
 
 
