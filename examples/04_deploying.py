@@ -6,8 +6,9 @@
     python examples/04_deploying.py --quick           # trains a small agent first: 25 s of CPU time
 
 Inputs and outputs are numpy arrays. `state` is the recurrent memory: pass it to the next call, or None at the start of
-an episode. The reward of the last step is an input, since the belief depends on it. If a sensor value is not finite,
-`predict` raises a `beliefrl.UserError` that names the entry. The state stays valid, so the control loop can continue.
+an episode. The reward of the last step is an input, since the belief depends on it (not with `--no-perceive-reward`).
+If a sensor value is not finite, `predict` raises a `beliefrl.UserError` that names the entry. The state stays valid, so
+the control loop can continue.
 """
 
 import pathlib
