@@ -8,9 +8,9 @@ from beliefrl.training.schedule import stages
 from worlds import Alternating, Counting, CountingAgent
 
 
-def events(agent, task, **options):
+def events(agent, task, steps=7, seed=0, seeds=1):
     """The events of a short training."""
-    return stages(agent, task, Options(**{"steps": 7, "eval_every": 7, "eval_episodes": 1} | options))
+    return stages(agent, task, Options(steps=steps, seed=seed, seeds=seeds, eval_every=7, eval_episodes=1))
 
 
 class Drawn(CountingAgent):
