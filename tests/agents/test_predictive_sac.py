@@ -116,6 +116,32 @@ def test_a_prediction_is_made_from_the_belief_before_in_the_units_of_the_task(st
     assert np.isnan(found[0]).all()
 
 
+def test_the_model_learns_to_predict_the_next_timestep_from_the_action_before_it(state):
+    first = jnp.zeros((2, TIME), bool).at[:, 0].set(True).at[1, 4].set(True)
+    window = noted(windows(jax.random.key(1), 2, TIME, first))
+    after, _, metrics = jax.jit(AGENT.learn_model)(state, window)
+    d = unrolled(state._replace(scales=after.scales), window).d
+    predicted = jax.vmap(jax.vmap(state.model.predict))(d[:-1], window.step.prev_action[1:])
+    error = np.asarray(predicted - after.scales.prediction(window.step)[1:])
+    np.testing.assert_allclose(metrics["loss_model"], np.mean(error[~first.T[1:]] ** 2), rtol=1e-5)
+
+
+def test_scales_are_of_known_beliefs_and_of_real_rewards(state):
+    """Nothing is known after a jump until an episode begins; its first timestep has no reward."""
+    first = jnp.zeros((2, TIME), bool).at[0, 3].set(True)
+    exists = jnp.ones((2, TIME), bool).at[0, -1].set(False)
+    window = noted(windows(jax.random.key(1), 2, TIME, first, exists))
+    reward = window.step.reward.at[3, 0].set(70.0)
+    window = window._replace(step=window.step._replace(reward=reward))
+    after, belief, _ = jax.jit(AGENT.learn_model)(state, window)
+    real = np.asarray(reward)[np.asarray(exists & ~first).T]
+    np.testing.assert_allclose(after.scales.reward.mean, [real.mean()], rtol=1e-5)
+    np.testing.assert_allclose(after.scales.reward.variance, [real.var()], rtol=1e-5)
+    known = np.asarray(belief)[3:-1, 0]
+    np.testing.assert_allclose(after.scales.belief.mean, known.mean(0), rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(after.scales.belief.variance, known.var(0), rtol=1e-4, atol=1e-6)
+
+
 def test_without_observations_a_prediction_is_made_from_earlier_predictions(state):
     """What is predicted of unobserved timesteps is what is predicted if they are as predicted."""
     window = noted(windows(jax.random.key(1), 1, TIME))

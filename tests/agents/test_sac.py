@@ -202,6 +202,27 @@ def test_an_update_trains_everything_and_the_targets_follow_slowly(state):
     assert differ(after.controller._replace(target_value=0), state.controller._replace(target_value=1))
 
 
+def test_the_critics_of_an_update_learn_from_the_target_lstm(state):
+    window, update = windows(jax.random.key(1), 2, TIME), jax.jit(RECURRENT.update)
+    other = state._replace(target_lstm=jax.tree.map(lambda leaf: leaf + 0.1, state.target_lstm))
+    plain, changed = (update(each, window, jax.random.key(2))[1] for each in (state, other))
+    assert plain["loss_q"] != changed["loss_q"]
+    np.testing.assert_allclose(plain["loss_actor"], changed["loss_actor"], rtol=1e-6)
+
+
+def test_the_lstm_learns_with_one_adam_for_the_critics_and_another_for_the_actor(state):
+    window, adams = windows(jax.random.key(1), 2, TIME), [RECURRENT.lstm_optimiser.init(state.lstm)] * 2
+    gradients, update, lstm = jax.jit(RECURRENT.gradients), jax.jit(RECURRENT.update), state.lstm
+    step = jax.jit(RECURRENT.lstm_optimiser.update)
+    for key in jax.random.split(jax.random.key(2)):
+        found, _ = gradients(state.lstm, state.target_lstm, state.controller, window, key)
+        for index in range(2):
+            change, adams[index] = step(found[index], adams[index])
+            lstm = jax.tree.map(jnp.add, lstm, change)
+        state, _ = update(state, window, key)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), state.lstm, lstm)
+
+
 def test_timesteps_that_do_not_exist_enter_no_loss(state):
     exists = jnp.ones((2, TIME), bool).at[:, 8:].set(False)
     results = changed_where_missing(RECURRENT, state, windows(jax.random.key(1), 2, TIME), exists)

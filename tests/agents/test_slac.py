@@ -140,6 +140,21 @@ def test_batches_are_aligned_in_time(state):
             np.testing.assert_array_equal(batch.belief[0, row], batch.next_belief[0, row - 2])
 
 
+def test_a_belief_knows_half_a_history_and_its_own_timestep(state):
+    """And nothing after it: the first belief is of timestep 3."""
+    window = windows(jax.random.key(1), 2, TIME)
+
+    @jax.jit
+    @jax.vmap
+    def belief(time):
+        obs = window.step.obs.at[time].add(1.0, mode="drop")
+        changed = window._replace(step=window.step._replace(obs=obs))
+        return AGENT.batches(state.model, changed, jax.random.key(2)).belief[0, :2]
+
+    found = belief(jnp.arange(TIME + 1))  # the last one changes nothing
+    assert np.any(found[:-1] != found[-1:], axis=(1, 2)).tolist() == [t in (1, 2, 3) for t in range(TIME)]
+
+
 @pytest.mark.slow
 def test_timesteps_that_do_not_exist_enter_no_loss(state):
     exists = jnp.ones((4, TIME), bool).at[:, 6:].set(False)

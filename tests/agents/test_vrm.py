@@ -138,6 +138,17 @@ def test_the_burn_in_and_the_sequence_are_one_unroll(state):
     np.testing.assert_allclose(rest.state.d, whole.state.d[4:], rtol=1e-5, atol=1e-6)
 
 
+def test_no_gradient_goes_into_the_burn_in(state):
+    """The weights by which the burn-in alone perceives the first input do not learn."""
+    window = windows(jax.random.key(1), 2)
+    obs = window.step.obs.at[AGENT.burn_in :, :, 0].set(0.0)
+    window = window._replace(step=window.step._replace(obs=obs))
+    gradient = jax.jit(jax.grad(lambda vrm: model_loss(vrm, window, jax.random.key(2), AGENT.burn_in)[0]))(state.keep)
+    weight = gradient.features.layers[0].weight
+    np.testing.assert_array_equal(weight[:, 0], 0.0)
+    assert np.all(weight[:, 1] != 0.0)
+
+
 def test_acting_forms_the_belief_that_replay_forms(state):
     """One timestep after the other as in acting, and all at once as in the replay: the same d, with the same z."""
     window = windows(jax.random.key(1), 1)

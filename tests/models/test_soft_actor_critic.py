@@ -342,6 +342,25 @@ def test_the_unit_is_the_root_mean_square_of_targets():
     np.testing.assert_allclose(controller.unit.u, np.sqrt(3.0), rtol=1e-3)  # of 1, 4, 4, 9, 0 and 0
 
 
+def test_the_unit_follows_the_returns_after_any_number_of_batches():
+    controller, y = make()._replace(unit=Unit(jnp.ones(()), jnp.array(1e6))), jnp.full(4, 10.0)
+    after = jax.jit(double_q.rescale)(controller, y, jnp.ones(4, bool))
+    np.testing.assert_allclose(after.unit.square, 1 + double_q.UNIT_RATE * (10**2 - 1), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("target_entropy", "wanted"), [(None, -ACTION), (1.5, 1.5)])
+def test_the_temperature_falls_with_the_entropy_above_its_target(target_entropy, wanted):
+    """Gradient descent on J_α with a rate of 1: log α rises by the mean of log π(ã|s) + H_target."""
+    optimisers, controller, data = Optimisers(*(optax.sgd(rate) for rate in (0.1, 0.1, 1.0))), make(), random_batch()
+    settings = {"tau": 0.1, "regulariser": 1e-3, "pessimism": 1.0, "likelihood": 0.0, "target_entropy": target_entropy}
+    given = init_optimisers(optimisers, controller), controller, data, KEY
+    after, _, metrics = jax.jit(lambda: double_q.update(optimisers, *given, **settings))()
+    _, log_prob, _ = policy(controller.actor, data.belief, np.asarray(jax.random.normal(KEY, (COUNT, ACTION))))
+    mean = np.mean(log_prob[np.asarray(data.valid)])
+    np.testing.assert_allclose(after.log_alpha, controller.log_alpha + mean + wanted, rtol=1e-4)
+    np.testing.assert_allclose(metrics["entropy"], -mean, rtol=1e-4)
+
+
 @pytest.mark.nightly
 @pytest.mark.parametrize("likelihood", [0.0, 0.1])
 @pytest.mark.parametrize("size", [0.01, 1000.0])

@@ -14,14 +14,16 @@ import numpy as np
 import pytest
 
 import beliefrl
-from beliefrl.runs import records
+from beliefrl.runs import best, records
 from beliefrl.runs.arrays import write_whole
 from beliefrl.runs.folder import free_folder
 from beliefrl.runs.options import Options
 from beliefrl.runs.records import provenance
 from beliefrl.runs.run import Recorder, Run
+from beliefrl.training import log
 from beliefrl.training.evaluation import summary
 from beliefrl.training.rollout import Episode
+from beliefrl.training.schedule import Event, Phase
 from beliefrl.types import UserError
 
 CONFIG = {
@@ -246,6 +248,14 @@ def test_saved_agents_come_back_bit_for_bit(recorder):
     for saved, back in zip(jax.tree.leaves(states()), jax.tree.leaves(loaded), strict=True):
         assert back.dtype == saved.dtype
         assert back.tobytes() == np.asarray(saved).tobytes()
+
+
+def test_the_best_agent_has_the_highest_return_with_sampled_actions(recorder):
+    for step, sampled, mode in ((10, 1.0, 9.0), (20, 2.0, 5.0)):
+        returns = jnp.broadcast_to(jnp.array([[sampled], [mode]]), (2, 2, 1))
+        evaluation = Episode(jnp.ones((2, 2, 1), bool), returns, jnp.ones((2, 2, 1), int), {})
+        log.record(recorder, Event(Phase.LEARNING, step, evaluation=evaluation, states=states()), ())
+    assert best.evaluations(recorder.folder, 2) == [{"step": 20, "return": 2.0}] * 2
 
 
 def test_there_is_nothing_to_load_before_the_first_save(recorder):

@@ -22,7 +22,7 @@ from beliefrl.tasks.pendulum import Pendulum, PendulumState
 from beliefrl.training import host_loop, initial, lockstep, phases, session
 from beliefrl.training.lockstep import Lockstep
 from beliefrl.types import UserError
-from worlds import MODELS, SEQUENCES, SHARED, Counting, CountingAgent, leaves, trained
+from worlds import MODELS, SEQUENCES, SHARED, Alternating, Counting, CountingAgent, CountingState, leaves, trained
 from wrong import Closing, Fine, Killed, Raising
 
 SMALL = {"vrm": MODELS | SEQUENCES, "sac-mlp": {"batch_size": 8, "pretrain_updates": 10, "standardise": True}}
@@ -122,6 +122,34 @@ def test_every_window_is_unbroken_in_time():
     np.testing.assert_allclose(result.episode_return, np.full((2, 2, 3), 28.0))
     assert result.done.all()
     program.close()
+
+
+@pytest.mark.parametrize(("ends", "limit", "where"), [(4, 1000, [4, 9]), (1000, 4, []), (4, 4, [4, 9])])
+def test_a_stored_timestep_is_terminal_where_the_task_ended_and_not_at_the_limit(ends, limit, where):
+    task = GymnasiumTask(Wrapped, "counting", {"task": Counting(ends, limit)}, measures=("success",))
+    program = host_loop.program(CountingAgent(), task, 60, 1, [0], "never")
+    seeds, _ = program.explore(program.begin(jax.random.split(jax.random.key(0), 1)), 0, 10)
+    program.close()
+    step = jax.tree.map(lambda leaf: leaf[0, : int(seeds.replay.added[0])], seeds.replay.timesteps.step)
+    assert np.flatnonzero(step.is_first).tolist() == [0, 5, 10]
+    assert np.flatnonzero(step.terminated).tolist() == where
+
+
+class Perceiving(CountingAgent):
+    """Its first action says whether it perceives a reward or an action before it."""
+
+    def act(self, state, memory, step, key, explore):
+        before = jnp.abs(step.reward) + jnp.abs(step.prev_action[0])
+        return jnp.where(step.is_first, 0.25 + before, 0.5)[None], memory
+
+
+def test_evaluated_episodes_begin_without_reward_and_action():
+    """The return is minus the first action."""
+    task = GymnasiumTask(Wrapped, "alternating", {"task": Alternating(max_steps=3)}, measures=("success",))
+    program = host_loop.program(Perceiving(), task, 60, 3, [0], "never")
+    result = program.evaluate(CountingState(jnp.zeros(1), jnp.zeros(1)), jax.random.split(jax.random.key(0), 1))
+    program.close()
+    np.testing.assert_array_equal(result.episode_return, np.full((1, 2, 3), -0.25))
 
 
 def played(lanes, steps=25):

@@ -96,6 +96,22 @@ def test_an_update_is_made_for_every_batch_and_no_two_have_one_key():
     assert np.array(seed.state.seen).any(axis=1).all()
 
 
+class Numbering(CountingAgent):
+    """Its metric is the number of updates before it."""
+
+    def pretrain(self, state, windows, key):
+        return state._replace(offset=state.offset + 1), {"number": state.offset}
+
+
+def test_metrics_of_the_pretraining_are_means_over_its_updates():
+    program, found = phases.compile_program(Numbering(), Counting(), capacity=90, episodes=1), []
+    seeds, _ = program.explore(program.begin(jax.random.split(jax.random.key(0), 2)), 0, 10)
+    for first, updates in ((0, 3), (3, 4)):
+        seeds, metrics = program.pretrain(seeds, first, updates)
+        found.append(metrics["number"].tolist())
+    assert found == [[1.0, 1.0], [4.5, 4.5]]
+
+
 def counting(steps=120, task=None):
     agent = CountingAgent()
     traces = []

@@ -6,6 +6,7 @@ import os
 import shutil
 import signal
 import threading
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +23,7 @@ from beliefrl.runs.checkpoint import Checkpoints, _sha256, _signed, listed
 from beliefrl.runs.run import Recorder, Run
 from beliefrl.tasks import make
 from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.training import session
 from beliefrl.training.schedule import Phase
 from beliefrl.training.stop import Stopped
 from beliefrl.types import UserError
@@ -58,11 +60,17 @@ def files(folder):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """A training that nothing happened to."""
+    """A training that nothing happened to, and must not: tests that resume it do so with `copied`."""
     folder = tmp_path_factory.mktemp("whole") / "run"
     events = []
     train(AGENT, "pendulum-v", folder, events.append, **OPTIONS)
     return folder, len(events)
+
+
+@pytest.fixture
+def copied(whole, tmp_path):
+    """A copy of this training."""
+    return shutil.copytree(whole[0], tmp_path / "copied")
 
 
 @pytest.mark.parametrize(
@@ -241,18 +249,45 @@ def test_a_finished_training_can_be_made_longer(whole, tmp_path):
         resume(run, steps=100)
 
 
-def test_resuming_what_is_finished_changes_nothing(whole):
-    folder, _ = whole
-    before = files(folder)
-    resume(folder)
-    assert files(folder) == before
+def test_resuming_what_is_finished_changes_nothing(copied):
+    before = files(copied)
+    resume(copied)
+    assert files(copied) == before
 
 
-def test_the_log_has_no_gap_and_no_row_twice(whole):
-    folder, _ = whole
-    steps = [row["step"] for row in Run(folder).rows(0, "update")]
-    assert steps == sorted(set(steps))
-    assert steps[-1] == 240
+@pytest.mark.slow
+def test_the_log_of_a_resumed_training_has_no_gap_and_no_row_twice(whole, tmp_path):
+    """It crashes after the last updates were logged and before they were saved."""
+    with pytest.raises(Crash):
+        train(AGENT, "pendulum-v", tmp_path / "run", crash_at(whole[1] - 2), **OPTIONS)
+    logged = {"pretrain": [100, 150], "update": [120, 220, 240], "evaluation": [120, 240]}
+    assert [row["step"] for row in Run(tmp_path / "run").rows(0, "update")] == logged["update"]
+    run = resume(tmp_path / "run")
+    for seed in range(2):
+        assert {kind: [row["step"] for row in run.rows(seed, kind)] for kind in logged} == logged
+
+
+@pytest.mark.parametrize(
+    ("due", "steps"),
+    [
+        ({"checkpoint_steps": 60, "keep_checkpoints": 2}, [120, 180]),
+        ({"checkpoint_steps": 0, "checkpoint_minutes": 1.0, "keep_checkpoints": 9}, [20, 120, 180]),
+    ],
+)
+@pytest.mark.slow
+def test_checkpoints_are_written_when_they_are_due_and_the_newest_are_kept(tmp_path, monkeypatch, due, steps):
+    """A step takes a second. The first checkpoint comes with the end of the pre-training."""
+    clock = SimpleNamespace(now=0.0, monotonic=lambda: clock.now)
+
+    def report(event):
+        clock.now = float(event.step)
+        if event.step == 240:
+            raise Crash
+
+    monkeypatch.setattr(session, "time", clock)
+    with pytest.raises(Crash):
+        train(AGENT, "pendulum-v", tmp_path / "run", report, **OPTIONS | {"eval_every": 60} | due)
+    assert [int(path.name.split("-")[-1]) for path in listed(tmp_path / "run")] == steps
 
 
 def test_where_the_checkpoints_are_gone_there_is_a_sentence(whole, tmp_path):
@@ -278,15 +313,14 @@ def test_a_training_that_fails_before_it_saved_anything_blocks_nothing(tmp_path)
         train(AGENT, "pendulum-v", folder, **OPTIONS)
 
 
-def test_a_run_that_is_being_trained_is_not_touched(whole):
-    folder, _ = whole
-    recorder = Recorder(folder, None)
+def test_a_run_that_is_being_trained_is_not_touched(copied):
+    recorder = Recorder(copied, None)
     try:
         with pytest.raises(UserError, match=f"is being trained by process {os.getpid()} on .+: stop it"):
-            resume(folder)
+            resume(copied)
     finally:
         recorder.close()
-    resume(folder)
+    resume(copied)
 
 
 @pytest.mark.nightly
@@ -299,13 +333,21 @@ def test_a_log_that_was_cut_is_an_error(whole, tmp_path):
 
 
 @pytest.mark.slow
-def test_an_environment_goes_on_from_the_start_of_an_episode(tmp_path):
-    task, notes = GymnasiumTask(Fine, "fine"), []
+@pytest.mark.parametrize(("envs", "saved_at"), [(1, 115), (2, 116)])
+def test_an_environment_goes_on_from_the_start_of_an_episode(tmp_path, envs, saved_at):
+    """Its checkpoint is from the middle of an episode of ten steps."""
+    task, notes, options = GymnasiumTask(Fine, "fine"), [], OPTIONS | {"steps": 230, "eval_every": 115, "envs": envs}
+
+    def report(event):
+        if event.step > saved_at:
+            raise Crash
+
     with pytest.raises(Crash):
-        train(AGENT, task, tmp_path / "run", crash_at(12), **OPTIONS)
+        train(AGENT, task, tmp_path / "run", report, **options)
     run = resume(tmp_path / "run", task=task, callback=lambda event: notes.append(event.note))
-    assert any("a new episode begins" in note for note in notes if note)
-    assert [row["step"] for row in run.rows(0, "evaluation")] == [120, 240]
+    said = [f"goes on from the checkpoint of step {saved_at}", "a new episode begins: an environment cannot be saved"]
+    assert [note for note in notes if note] == said
+    assert [row["step"] for row in run.rows(0, "evaluation")] == [saved_at, 230]
     assert {row["length"] for row in run.rows(0, "episode")} == {10}
 
 
@@ -355,6 +397,8 @@ def test_a_seed_that_diverges_stops_alone(tmp_path, monkeypatch, what, why):
     np.testing.assert_array_equal(np.isnan(means), [[False, False], [False, True]])
     assert draw_curve(run).exists()
     assert json.loads((run.folder / "results.json").read_text())
+    resume(run, steps=260)
+    assert [len(list(run.rows(seed, "diverged"))) for seed in range(2)] == [0, 1]
 
 
 def test_the_first_signal_is_a_checkpoint_and_a_word_how_to_go_on(whole, tmp_path):

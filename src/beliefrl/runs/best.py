@@ -47,10 +47,10 @@ def save(folder: pathlib.Path, agents: Any, step: int, returns: Sequence[float])
     path = folder / BEST
     try:
         found = evaluations(folder, len(returns))
-        saved = arrays.load(path) if path.exists() else None
+        saved = arrays.load(path) if path.exists() else {}
     except arrays.Damaged:
         path.replace(folder / f"damaged-{BEST}")
-        found, saved = [None] * len(returns), None
+        found, saved = [None] * len(returns), {}
     pairs = enumerate(zip(returns, found, strict=True))
     better = [index for index, (new, old) in pairs if np.isfinite(new) and (old is None or new > old["return"])]
     if not better:
