@@ -2,7 +2,7 @@
 
     pip install -c constraints.txt -e .             # in a clone of the repository
     beliefrl train predictive-sac gym:Pendulum-v1 --observe 2 --steps 8000 --out runs/pendulum
-    python examples/04_deploying.py runs/pendulum     # a run on a Gymnasium environment: 12 s of CPU time
+    python examples/04_deploying.py runs/pendulum     # 12 s of CPU time
     python examples/04_deploying.py --quick           # trains a small agent first: 25 s of CPU time
 
 Inputs and outputs are numpy arrays. `state` is the recurrent memory: pass it to the next call, or None at the start of
@@ -29,8 +29,7 @@ def main(run: tyro.conf.Positional[str] = "runs/pendulum", episodes: int = 3, qu
         beliefrl.train(agent, task, run, resume=True, steps=300)
     policy = beliefrl.load(run)
     print(policy)  # shows agent, task, sizes, seed
-    task = beliefrl.task_of(run)
-    environment = task.environment()  # as in training: only the observed entries, actions in [-1, 1]
+    environment = beliefrl.make_env(run)  # as in training: only the observed entries, actions in [-1, 1]
     totals = []
     for episode in range(episodes):
         obs, _ = environment.reset(seed=episode)

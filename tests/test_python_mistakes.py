@@ -32,6 +32,8 @@ MISTAKES = {
     "tune('vrm', 'pendulum', constants=3)": "constants=3 is impossible: give a dictionary",
     "demo('pendulum-v', 3)": "3 is no path",
     "make_task(3)": "3 is not the name of a task",
+    "make_task('gym:Pendulum-v1', measures=3)": "measures=3 is impossible: give a tuple of names, ('success',).",
+    "make_env(3)": "3 is no task",
     "train('vrm', 'pendulum', 3)": "3 is no path",
     "train('vrm', 'pendulum', callback=3)": "callback=3 is impossible: give a function of an Event.",
     "film(3)": "3 is not a run",

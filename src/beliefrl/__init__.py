@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from beliefrl.training.train import resume, train
     from beliefrl.types import Spec, StoredTimestep, Timestep, UserError, Window, WindowShape
     from beliefrl.viewing.demo import demo
-    from beliefrl.viewing.episodes import Trajectory, play
+    from beliefrl.viewing.episodes import Trajectory, make_env, play
     from beliefrl.viewing.films import film, video
     from beliefrl.viewing.prediction import Predictions, draw_predictions, predictions
 
@@ -76,6 +76,7 @@ __all__ = [
     "grid",
     "load",
     "make_agent",
+    "make_env",
     "make_task",
     "observe",
     "play",
@@ -125,6 +126,7 @@ _HOMES = {
     "grid": "sweeps.experiments:grid",
     "load": "policy:load",
     "make_agent": "agents:make",
+    "make_env": "viewing.episodes:make_env",
     "make_task": "tasks:make",
     "observe": "tasks:observe",
     "play": "viewing.episodes:play",

@@ -121,7 +121,7 @@ class Policy:
         Args:
             obs: o_t, (obs,) or (batch, obs).
             reward: r_{t-1}, which came with `obs`, a number or (batch,); ignored at the start of an episode. It may be
-                left out there, and always if the agent does not observe it (`sac-mlp`).
+                left out there, and always if the agent does not observe it, such as `sac-mlp`.
             state: the state that the previous call returned; None at the start of all episodes.
             episode_start: whether an episode starts with `obs`, a bool or (batch,); None: True if `state` is None.
             deterministic: True takes the policy's mode, False samples the action.

@@ -14,7 +14,7 @@ from beliefrl.tasks import TASKS, describe, entry_names, given, make, names, obs
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.pendulum import Pendulum
 from beliefrl.tasks.target_reaching import TargetReaching
-from beliefrl.types import UserError
+from beliefrl.types import UserError, tuples
 from worlds import Counter, Counting, installed
 from wrong import Fine
 
@@ -300,3 +300,13 @@ def test_a_class_of_environments_can_be_changed_as_it_is():
 def test_a_gymnasium_task_needs_something_that_makes_environments(make):
     with pytest.raises(UserError, match="GymnasiumTask needs a class or function that makes environments, not"):
         GymnasiumTask.__post_init__(SimpleNamespace(make=make))  # the constructor's types are checked in tests
+
+
+@pytest.mark.parametrize("measures", ["success", ["success"], ("success",)])
+def test_measures_of_a_registered_environment_are_recorded_with_its_task(measures):
+    task = make("gym:Pendulum-v1", measures=measures)
+    assert task.measures == ("success",)
+    described = describe(task)
+    assert described == {"task": "gym:Pendulum-v1", "constants": {"measures": ["success"]}, "observe": None}
+    assert make(described["task"], **tuples(described["constants"])).measures == ("success",)
+    assert not task.arguments

@@ -50,7 +50,7 @@ def save(folder: pathlib.Path, agents: Any, step: int, returns: Sequence[float])
         saved = arrays.load(path) if path.exists() else {}
     except arrays.Damaged:
         path.replace(folder / f"damaged-{BEST}")
-        found, saved = [None] * len(returns), {}
+        found, saved = evaluations(folder, len(returns)), {}
     pairs = enumerate(zip(returns, found, strict=True))
     better = [index for index, (new, old) in pairs if np.isfinite(new) and (old is None or new > old["return"])]
     if not better:

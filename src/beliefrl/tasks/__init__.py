@@ -115,7 +115,8 @@ def make(
         faults: missing and faulty sensors, which apply to the entries that the agent sees; also as a dictionary such as
             {"noise": 0.1}. None: no faults.
         steps_per_action: number of the task's steps for which an action is applied (`with_action_repeat`).
-        constants: physical constants of the task to change, or arguments of gymnasium.make.
+        constants: physical constants of the task to change, or arguments of gymnasium.make. For a Gymnasium environment
+            also `measures`: the entries of its info that are recorded, such as "success".
 
     Raises:
         UserError: there is no such task, constant or fault, a value is impossible, or `observe` or the noise does not
@@ -230,4 +231,5 @@ def _describe_gymnasium(task: GymnasiumTask) -> dict[str, Any]:
     implied = robot is not None and task.indices == getattr(robot, str(mask))
     name = base if robot is not None and not implied else task.name  # the indices are of the full observation
     observe = None if implied or task.indices is None else list(task.indices)
-    return {"task": name, "constants": dict(task.arguments), "observe": observe}
+    measures = {"measures": list(task.measures)} if task.measures and hasattr(task.make, "id") else {}
+    return {"task": name, "constants": {**task.arguments, **measures}, "observe": observe}

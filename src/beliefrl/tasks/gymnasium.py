@@ -48,6 +48,8 @@ class GymnasiumTask:
             raise UserError(f"GymnasiumTask needs a class or function that makes environments, not {short(self.make)}.")
         if isinstance(self.measures, str):
             raise UserError(f"measures={self.measures!r} is a text: give a tuple, ({self.measures!r},).")
+        if not isinstance(self.measures, tuple) or not all(isinstance(name, str) for name in self.measures):
+            raise UserError(f"measures={short(self.measures)} is impossible: give a tuple of names, ('success',).")
         check_measures(self.measures, "The task")
         if self.max_steps is not None:
             check_range(self, ("max_steps",), 1)

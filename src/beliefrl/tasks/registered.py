@@ -41,7 +41,8 @@ def similar(id: str) -> str | None:
 def make(id: str, arguments: dict[str, Any], name: str | None = None) -> GymnasiumTask:
     """The task with a Gymnasium id, `Id` or `package:Id`; the package is imported, to register the environment.
 
-    `arguments` are those of gymnasium.make: max_episode_steps, and the environment's own.
+    `arguments` are those of gymnasium.make: max_episode_steps, and the environment's own. One more, `measures`, names
+    the entries of its info that are recorded (`GymnasiumTask.measures`), one or several.
 
     Raises:
         UserError: there is no such environment, a package is missing, or an argument is impossible.
@@ -60,7 +61,11 @@ def make(id: str, arguments: dict[str, Any], name: str | None = None) -> Gymnasi
     limit = arguments.get("max_episode_steps")
     if limit is not None:
         check_whole("max_episode_steps", limit, 1)
-    return GymnasiumTask(_Registered(id), name, dict(arguments))
+    own = dict(arguments)
+    measures = own.pop("measures", ())
+    measures = (measures,) if isinstance(measures, str) else measures
+    measures = tuple(measures) if isinstance(measures, list) else measures
+    return GymnasiumTask(_Registered(id), name, own, measures=measures)
 
 
 def _import(package: str, id: str) -> None:

@@ -11,6 +11,7 @@ from jaxtyping import Array, Key
 
 from beliefrl import agents, tasks
 from beliefrl.agents import Agent, hyperparameters
+from beliefrl.catalogue import MASKS
 from beliefrl.imports import path
 from beliefrl.runs.options import MOST_EPISODES
 from beliefrl.runs.records import finite_mean, finite_or_none
@@ -186,16 +187,15 @@ def task_of(run: Run | str | os.PathLike[str], task: Task | GymnasiumTask | type
     if task is not None:
         made = tasks.given(task)
         asked, there = map(about_task, (tasks.describe(made), run.config))
-        if asked["observe"] != there["observe"]:
+        shown, before = map(_entries, (asked, there))
+        if asked["observe"] != there["observe"] or {shown, before} == set(MASKS.values()):
             raise UserError(
-                f"{run.folder} was trained on {_entries(there['observe'])} of the observation, and the given task "
-                f"shows {_entries(asked['observe'])}: give the same."
+                f"{run.folder} was trained on {before} of the observation, and the given task shows {shown}: give them."
             )
-        if asked["steps_per_action"] != there["steps_per_action"]:
-            raise UserError(
-                f"{run.folder} was trained with steps_per_action={there['steps_per_action']}, and the given task has "
-                f"{asked['steps_per_action']}: give the same (beliefrl.with_action_repeat)."
-            )
+        now, before = (each["steps_per_action"] for each in (asked, there))
+        if now != before:
+            given = f"and the given task has {now}: give the same (beliefrl.with_action_repeat)."
+            raise UserError(f"{run.folder} was trained with steps_per_action={before}, {given}")
         return made
     name, constants = run.config["task"], tuples(run.config["constants"])
     if not tasks.knows(name):
@@ -207,8 +207,12 @@ def task_of(run: Run | str | os.PathLike[str], task: Task | GymnasiumTask | type
         return tasks.make(name, run.config.get("observe"), run.config.get("faults"), **constants)
 
 
-def _entries(observed: list[int] | None) -> str:
-    return "all entries" if observed is None else f"entries {' '.join(map(str, observed))}"
+def _entries(about: dict[str, Any]) -> str:
+    """Which entries the agent sees, given `checks.about_task`."""
+    observed = about["observe"]
+    return (
+        MASKS.get(about["task"][-2:], "all entries") if observed is None else f"entries {' '.join(map(str, observed))}"
+    )
 
 
 @contextlib.contextmanager

@@ -11,15 +11,19 @@ MuJoCo renders through EGL. Any other Gymnasium environment must have a render m
 
 import dataclasses
 import os
+import pathlib
 import sys
 import warnings
 from collections.abc import Callable, Container
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
+import gymnasium
 import jax
 import numpy as np
+from gymnasium.wrappers import TimeLimit
 from jaxtyping import Int, UInt8
 
+from beliefrl import tasks
 from beliefrl.agents import Agent
 from beliefrl.analysis.tables import measure_text
 from beliefrl.runs.run import Run
@@ -28,7 +32,7 @@ from beliefrl.tasks.environment import TaskEnvironment
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.interface import measure_of
 from beliefrl.tasks.seen_environment import Environment
-from beliefrl.training.evaluation import restore_seed
+from beliefrl.training.evaluation import check_interface, restore_seed, task_of
 from beliefrl.types import LARGEST, Timestep, UserError, check_whole, said
 
 Pixels = UInt8[np.ndarray, "height width 3"]
@@ -172,6 +176,27 @@ def check_episode(episode_seed: int, steps: int | None = None) -> None:
     """Raise a UserError if one of the arguments is out of range."""
     check_whole("episode_seed", episode_seed, 0)
     check_whole("steps", 1 if steps is None else steps, 1)
+
+
+def make_env(of: Run | str | os.PathLike[str] | Task | GymnasiumTask | type) -> gymnasium.Env[Any, Any]:
+    """Make a Gymnasium environment in which a trained agent can act: as the agent sees it, with its time limit.
+
+    Observations are the entries that the agent sees, (obs_dim,) float32; actions are in [-1, 1].
+
+    Args:
+        of: a run or its folder, or a task: its name, the task itself, or a class of environments. For a run on a task
+            of your own, give the task.
+
+    Raises:
+        UserError: there is no such run or task, or the environment cannot be made, or has other entries than in the
+            training.
+    """
+    is_run = isinstance(of, Run | os.PathLike) or (isinstance(of, str) and (pathlib.Path(of) / "config.json").exists())
+    task = task_of(cast(Any, of)) if is_run else tasks.given(of)
+    if is_run:
+        check_interface(of if isinstance(of, Run) else Run(cast(Any, of)), task)
+    environment = playable(task)
+    return TimeLimit(environment, task.spec.max_steps) if isinstance(environment, TaskEnvironment) else environment
 
 
 def playable(task: Task | GymnasiumTask, rendered: bool = False) -> TaskEnvironment | Environment:

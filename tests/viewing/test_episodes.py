@@ -1,0 +1,52 @@
+"""Episodes of a trained agent: the environments in which it acts."""
+
+import numpy as np
+import pytest
+
+import beliefrl
+from beliefrl import UserError, evaluate, load, make_env, make_task
+from beliefrl.tasks.gymnasium import GymnasiumTask
+from worlds import saved
+from wrong import Fine
+
+
+def length(environment, policy):
+    """The number of steps of an episode in which the policy acts."""
+    obs, _ = environment.reset(seed=0)
+    reward, state, done, steps = None, None, False, 0
+    while not done:
+        assert obs.shape == (policy.spec.obs_dim,)
+        action, state = policy.predict(obs, reward, state)
+        obs, reward, terminated, truncated, _ = environment.step(action)
+        done, steps = terminated or truncated, steps + 1
+    environment.close()
+    return steps
+
+
+def test_an_environment_is_made_from_a_run_its_folder_or_a_task(tmp_path):
+    task = make_task("pendulum-v", max_steps=7)
+    run = saved(tmp_path / "run", "sac-mlp", task)
+    for of in (run, run.folder, str(run.folder), task):
+        assert length(make_env(of), load(run)) == 7
+    assert length(make_env("pendulum-v"), load(run)) == 200
+
+
+def test_an_environment_of_gymnasium_shows_what_the_agent_sees(tmp_path):
+    task = GymnasiumTask(Fine, indices=(1,))
+    policy = load(saved(tmp_path / "run", "sac-mlp", task), task=task)
+    assert length(make_env(task), policy) == 10
+    assert np.array_equal(make_env(task).action_space.high, [1.0])
+    assert make_env("gym:Pendulum-v1").observation_space.shape == (3,)
+
+
+def test_what_no_environment_can_be_made_of_is_one_sentence(tmp_path):
+    for of in ("pendulum-x", tmp_path / "nowhere"):
+        with pytest.raises(UserError):
+            beliefrl.make_env(of)
+
+
+def test_an_agent_of_velocities_is_not_evaluated_on_positions(tmp_path):
+    """Both have two entries, and both names imply which."""
+    run = saved(tmp_path / "run", "sac-mlp", make_task("cartpole-v"))
+    with pytest.raises(UserError, match="on velocities of the observation, and the given task shows positions: give"):
+        evaluate(run, task=make_task("cartpole-p"))
