@@ -13,8 +13,12 @@ import beliefrl
 from beliefrl import agents, tasks
 from beliefrl.policy import Policy
 from beliefrl.runs.run import Run
+from beliefrl.tasks import make
+from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import rollout
 from beliefrl.types import UserError
+from worlds import saved
+from wrong import Fine
 
 SMALL = {
     "vrm": {"d_size": 8, "z_size": 4, "hidden_size": 8},
@@ -216,3 +220,14 @@ def test_a_runs_policy_is_loaded_by_its_seed(tmp_path):
     np.testing.assert_array_equal(beliefrl.load(tmp_path / "run").predict([0.1, 0.2])[0], first)
     with pytest.raises(UserError, match="has no seed 6: it has 4, 5"):
         beliefrl.load(run, 6)
+
+
+def test_actions_are_scaled_to_the_bounds_of_the_environment(tmp_path):
+    task = GymnasiumTask(Fine)  # its action is in [-2, 6]
+    run = saved(tmp_path / "run", "sac-mlp", task)
+    policy = beliefrl.load(run, task=task)
+    policy.interface = task.interface
+    np.testing.assert_allclose(policy.scale([[-1.0], [0.0], [0.5], [3.0]]), [[-2.0], [2.0], [4.0], [6.0]])
+    np.testing.assert_allclose(policy.scale(np.array([-0.5])), [0.0])
+    with pytest.raises(UserError, match=r"a task in JAX has none, its actions are in \[-1, 1\]"):
+        beliefrl.load(saved(tmp_path / "other", "sac-mlp", make("pendulum"))).scale([0.0])

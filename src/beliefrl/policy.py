@@ -163,6 +163,23 @@ class Policy:
             raise UserError(f"obs or reward{which} is too large for this policy: its action would not be finite.")
         return (action[0] if single else action), after
 
+    def scale(self, action: Any) -> np.ndarray:
+        """Scale actions to the bounds of the actions of the Gymnasium environment of the training.
+
+        Args:
+            action: an action of `predict`, (action,) or (batch, action); it is clipped to [-1, 1].
+
+        Returns:
+            low + (action + 1) / 2 · (high - low), of the same shape.
+
+        Raises:
+            UserError: the policy has no bounds: it was trained on a task in JAX.
+        """
+        if self.interface is None:
+            raise UserError("scale needs bounds of actions: a task in JAX has none, its actions are in [-1, 1].")
+        low, high = np.array(self.interface.low), np.array(self.interface.high)
+        return low + (np.clip(numbers(action, "action"), -1.0, 1.0) + 1) / 2 * (high - low)
+
     def _check_unused(self, after: State, other: State) -> None:
         """Raise a UserError if the state after a reward that is NaN differs from that after 0."""
         if not all(np.array_equal(a, b) for a, b in zip(after, other, strict=True)):

@@ -131,7 +131,7 @@ def test_evaluate_prints_one_object_and_the_same_for_the_same_seed(trained):
     assert set(result) == {"episodes", "sampled", "mode"}
     assert result["episodes"] == 3
     for mode in ("sampled", "mode"):
-        assert set(result[mode]) == {"mean", "sem", "seeds", "success", "seeds_success"}
+        assert set(result[mode]) == {"mean", "sem", "seeds", "returns", "lengths", "success", "seeds_success"}
         assert len(result[mode]["seeds"]) == 2
         assert result[mode]["success"] is None
 

@@ -1,10 +1,13 @@
 """Episodes of a trained agent: the environments in which it acts."""
 
+import json
+
 import numpy as np
 import pytest
 
 import beliefrl
 from beliefrl import UserError, evaluate, load, make_env, make_task
+from beliefrl.cli import main
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from worlds import saved
 from wrong import Fine
@@ -50,3 +53,22 @@ def test_an_agent_of_velocities_is_not_evaluated_on_positions(tmp_path):
     run = saved(tmp_path / "run", "sac-mlp", make_task("cartpole-v"))
     with pytest.raises(UserError, match="on velocities of the observation, and the given task shows positions: give"):
         evaluate(run, task=make_task("cartpole-p"))
+
+
+def played(capsys, folder, *options):
+    main(["evaluate", str(folder), "--episodes", "2", "--json", *options])
+    return json.loads(capsys.readouterr().out)["mode"]
+
+
+def test_a_run_is_evaluated_with_other_constants_and_faults(tmp_path, capsys):
+    run = saved(tmp_path / "run", "sac-mlp", make_task("pendulum-v", max_steps=20, faults={"noise": 0.5}))
+    before = played(capsys, run.folder)
+    assert before["lengths"] == [[20, 20]]
+    assert played(capsys, run.folder, "--constants", "max_steps=7")["lengths"] == [[7, 7]]
+    assert played(capsys, run.folder, "--constants", "mass=3.5")["returns"] != before["returns"]
+    assert played(capsys, run.folder, "--faults", "noise=0.0")["returns"] != before["returns"]
+    assert played(capsys, run.folder, "--faults", "noise=0.5") == before
+    with pytest.raises(SystemExit) as ended:
+        played(capsys, run.folder, "--constants", "weight=3")
+    assert ended.value.code == 2
+    assert "The task pendulum has no constant 'weight'" in capsys.readouterr().err

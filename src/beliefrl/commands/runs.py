@@ -6,11 +6,14 @@ import json
 import pathlib
 import sys
 from collections.abc import Sequence
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from beliefrl.commands.arguments import Best, OwnAgent, own_agent, parse
+from beliefrl.commands.arguments import Best, OwnAgent, named_values, own_agent, parse
+
+if TYPE_CHECKING:
+    from beliefrl.runs.run import Run
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,7 +27,12 @@ class EvaluateOptions:
     seed: int = 0
     """Random seed of the episodes. The same seed gives the same results."""
     json: bool = False
-    """Print one JSON object: for each kind of actions the mean, S.E.M., mean of each seed, and success rates."""
+    """Print one JSON object: for each kind of actions the mean, S.E.M., mean of each seed, success rates, and the
+    return and length of each episode."""
+    constants: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    """Constants of the task that differ from those of the training."""
+    faults: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    """Faults of the sensors that differ from those of the training, such as noise=0.1."""
     best: Best = False
     agent: OwnAgent = None
 
@@ -83,11 +91,11 @@ def evaluate(argv: Sequence[str]) -> None:
     from beliefrl.training.evaluation import evaluate as play
 
     run = Run(options.run)
-    agent, shown = own_agent(options.agent), not options.json
+    agent, shown, task = own_agent(options.agent), not options.json, _changed_task(run, options)
     elsewhere = contextlib.redirect_stdout(sys.stderr) if options.json else contextlib.nullcontext()
     with elsewhere:  # what an environment prints
         results = play(
-            run, options.episodes, options.seed, agent=agent, progress=shown, best=options.best, own_process=True
+            run, options.episodes, options.seed, task, agent, progress=shown, best=options.best, own_process=True
         )
     if options.json:
         print(json.dumps(json.loads(json.dumps(results), parse_constant=lambda _: None)))  # null for a diverged seed
@@ -98,6 +106,19 @@ def evaluate(argv: Sequence[str]) -> None:
     for seed in run.seeds:
         for row in run.rows(seed, "diverged"):
             print(f"seed {seed} diverged by step {row['step']:,}: its agent is from an evaluation before that")
+
+
+def _changed_task(run: "Run", options: EvaluateOptions) -> Any:
+    """The run's task with the constants and faults of the options; None if there are none."""
+    from beliefrl import tasks
+    from beliefrl.types import tuples
+
+    if not options.constants and not options.faults:
+        return None
+    there, constants = run.config, named_values(options.constants, "--constants")
+    faults = (there.get("faults") or {}) | named_values(options.faults, "--faults")
+    constants = tuples(there["constants"] | constants)
+    return tasks.make(there["task"], there.get("observe"), faults or None, **constants)
 
 
 def export(argv: Sequence[str]) -> None:

@@ -12,7 +12,7 @@ from beliefrl.errors import UserError, short
 from beliefrl.tasks.spaces import check_names, observation_names
 
 UNNAMED = "entry "
-TAKEN = {"step", "kind", "return", "length", "mean", "sem", "seeds"}  # entries of the log and of results
+TAKEN = {"step", "kind", "return", "length"} | {"mean", "sem", "seeds", "returns", "lengths"}  # of the log, of results
 
 
 class Interface(NamedTuple):

@@ -32,7 +32,8 @@ MODES = ("sampled", "mode")  # how actions are chosen; the second axis of an eva
 
 
 def summary(result: Episode) -> dict[str, Any]:
-    """For each mode: the mean return of every seed, their mean, its standard error (None with one seed), the measures.
+    """For each mode: the mean return of every seed, their mean, its standard error (None with one seed), the measures,
+    and the returns and lengths of all episodes, (seed, episodes).
 
     Leaves of `result` are (seed, mode, episodes).
     """
@@ -45,6 +46,8 @@ def summary(result: Episode) -> dict[str, Any]:
             "mean": float(finite.mean()),
             "sem": float(finite.std(ddof=1) / np.sqrt(finite.size)) if finite.size > 1 else None,
             "seeds": list(map(finite_or_none, seeds)),
+            "returns": [list(map(finite_or_none, episodes)) for episodes in returns[:, index]],
+            "lengths": np.asarray(result.length)[:, index].tolist(),
             "success": None,
             "seeds_success": None,
         }
@@ -251,10 +254,10 @@ def evaluate(
         own_process: as in `train`. Then each environment of a run with processes="always" has a process of its own.
 
     Returns:
-        {"episodes", "sampled": {"mean", "sem", "seeds", "success", "seeds_success"}, "mode": the same}. Returns are
-        undiscounted; "sem" is over seeds and None with one. "success" is a rate in [0, 1], None if the task does not
-        define success. Other measures of the task have entries of the same kind, such as "distance" and
-        "seeds_distance".
+        {"episodes", "sampled": {"mean", "sem", "seeds", "returns", "lengths", "success", "seeds_success"}, "mode": the
+        same}. Returns are undiscounted; "sem" is over seeds and None with one. "returns" and "lengths" are those of all
+        episodes, a list for each seed. "success" is a rate in [0, 1], None if the task does not define success. Other
+        measures of the task have entries of the same kind, such as "distance" and "seeds_distance".
 
     Raises:
         UserError: there is no such run, nothing was saved in it, or a number is impossible.
