@@ -82,7 +82,7 @@ class StackAgent(SACAgent):
         """Perceive a timestep, and choose an action."""
         older = jnp.where(step.is_first, jnp.broadcast_to(step.obs, memory.shape), memory)
         memory = jnp.concatenate([older[1:], step.obs[None]])
-        return self.choose(state.controller, memory.reshape(-1), key, explore), memory
+        return self.choose(state.controller.actor(memory.reshape(-1)), key, explore), memory
 
     def note(self, memory: Float[Array, "stack obs"]) -> tuple[()]:
         """What the replay stores with the timestep: nothing."""

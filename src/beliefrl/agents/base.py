@@ -97,21 +97,11 @@ class ControllerAgent:
 
     def choose(
         self,
-        controller: Any,
-        actor_input: Float[Array, " actor_input"],
-        key: Key[Array, ""],
-        explore: Bool[Array, ""],
-    ) -> Float[Array, " action"]:
-        """An action: a sample of the policy, or its mode if not `explore`."""
-        return self.choose_from(controller.actor(actor_input), key, explore)
-
-    def choose_from(
-        self,
         policy: tuple[Float[Array, " action"], Float[Array, " action"]],
         key: Key[Array, ""],
         explore: Bool[Array, ""],
     ) -> Float[Array, " action"]:
-        """An action of a policy with this μ and log σ."""
+        """An action of the policy with this μ and log σ: a sample, or its mode if not `explore`."""
         mean, log_sigma = policy
         noise = jnp.where(explore, jax.random.normal(key, mean.shape), 0.0)
         return tanh_gaussian(mean, log_sigma, noise)[0]

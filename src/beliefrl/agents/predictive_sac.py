@@ -235,7 +235,7 @@ class PredictiveSACAgent(ControllerAgent):
         memory, x = perceive(state.model, state.scales, memory, step, self.perceived)
         belief = jnp.concatenate([memory.lstm.d, x])
         policy = state.controller.actor(standardise(state.scales.belief, belief))
-        return self.choose_from(policy, key, explore), memory._replace(note=memory.note._replace(policy=policy))
+        return self.choose(policy, key, explore), memory._replace(note=memory.note._replace(policy=policy))
 
     def note(self, memory: Memory) -> Note:
         return memory.note

@@ -120,7 +120,7 @@ class SACLSTMAgent(SACAgent):
         self, state: State, memory: LSTMState, step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]
     ) -> tuple[Float[Array, " action"], LSTMState]:
         memory = state.lstm.step(memory, self.perception(step), step.is_first)
-        return self.choose(state.controller, memory.d, key, explore), memory
+        return self.choose(state.controller.actor(memory.d), key, explore), memory
 
     def note(self, memory: LSTMState) -> tuple[()]:
         return ()

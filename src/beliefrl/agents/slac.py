@@ -141,7 +141,7 @@ class SLACAgent(SACAgent):
     ) -> tuple[Float[Array, " action"], Float[Array, "history x"]]:
         x = perception(step)
         memory = jnp.where(step.is_first, x[None], jnp.concatenate([memory[1:], x[None]]))
-        return self.choose(state.controller, memory.ravel(), key, explore), memory
+        return self.choose(state.controller.actor(memory.ravel()), key, explore), memory
 
     def note(self, memory: Float[Array, "history x"]) -> tuple[()]:
         return ()

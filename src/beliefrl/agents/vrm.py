@@ -212,7 +212,8 @@ class VRMAgent(SACAgent):
             self.perceive(state.keep, memory.keep, step, key_keep, explore),
         )
         belief = jnp.concatenate([*(part.d for part in memory if part is not None), perception(step)])
-        return self.choose(state.controller, standardise(state.scale, belief), key_action, explore), memory
+        policy = state.controller.actor(standardise(state.scale, belief))
+        return self.choose(policy, key_action, explore), memory
 
     def note(self, memory: Memory) -> tuple[Float[Array, " d"], ...]:
         """d_t of the first-impression model, then the state of the keep-learning model, if they are stored."""
