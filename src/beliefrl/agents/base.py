@@ -173,17 +173,11 @@ class SACAgent(ControllerAgent):
         noise = jax.random.normal(key, batch.action.shape)
         return loss(controller, batch, noise, self.actor_regulariser, self.target_entropy)
 
-    def learn_controller(
-        self, controller: Controller, state: OptimiserState, batch: Batch, key: Key[Array, ""]
-    ) -> tuple[Controller, OptimiserState, Metrics]:
-        """One update on transitions whose beliefs are given."""
-        gradient, metrics = jax.grad(self.controller_loss, has_aux=True)(controller, batch, key)
-        controller, state = update(self.optimisers, state, controller, gradient, self.tau)
-        return controller, state, metrics
-
     def update(self, state: Any, batch: Any, key: Key[Array, ""]) -> tuple[Any, Metrics]:
         """One update of the controller, of a state with `controller` and `controller_optimiser`."""
-        controller, optimiser, metrics = self.learn_controller(state.controller, state.controller_optimiser, batch, key)
+        controller, optimiser = state.controller, state.controller_optimiser
+        gradient, metrics = jax.grad(self.controller_loss, has_aux=True)(controller, batch, key)
+        controller, optimiser = update(self.optimisers, optimiser, controller, gradient, self.tau)
         return state._replace(controller=controller, controller_optimiser=optimiser), metrics
 
 
