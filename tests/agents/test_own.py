@@ -70,7 +70,7 @@ def recorded(agent):
 
 def test_an_agent_is_made_by_the_path_of_its_class():
     assert agents.make(OWN, cycle=6) == CountingAgent(cycle=6)
-    assert agents.find(OWN) == CountingAgent()
+    assert agents.make(OWN) == CountingAgent()
     assert agents.name_of(CountingAgent()) == OWN
     assert agents.name_of(agents.make("beliefrl.agents.sac_mlp:SACMLPAgent")) == "sac-mlp"
 

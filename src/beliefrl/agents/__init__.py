@@ -168,16 +168,6 @@ def check_class(kind: type) -> type:
     return kind
 
 
-def find(name: str) -> Any:
-    """The agent of that name with the hyperparameters that belong to this name; see `find_class`.
-
-    Raises:
-        UserError: no agent has that name, or the class is not an agent, or a hyperparameter has no default.
-    """
-    agent = named(name)
-    return build(agent, {}, name) if isinstance(agent, type) else agent
-
-
 def make(name: str, /, **hyperparameters: Any) -> Agent:
     """The agent of that name; `hyperparameters` replace its defaults.
 

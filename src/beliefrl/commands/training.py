@@ -97,7 +97,7 @@ def train(argv: Sequence[str]) -> None:
     from beliefrl.training.train import train as run_training
 
     options_type = agent_options(
-        agents.find(name),
+        agents.make(name),
         {
             "task": (TaskName, dataclasses.MISSING),
             "observe": (Observe, ()),

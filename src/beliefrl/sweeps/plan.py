@@ -217,7 +217,7 @@ def options_of(training: Training) -> Options:
 
 def agent_of(name: str, hyperparameters: dict[str, Any]) -> Any:
     """The agent of that name with hyperparameters as JSON has them."""
-    return agents.make(name, **_typed(hyperparameters, agents.find(name)))
+    return agents.make(name, **_typed(hyperparameters, agents.make(name)))
 
 
 def _typed(values: dict[str, Any], like: Any) -> dict[str, Any]:
