@@ -114,7 +114,7 @@ class SACLSTMAgent(SACAgent):
         return jnp.concatenate(parts, axis=-1)
 
     def reset(self, spec: Spec) -> LSTMState:
-        return LSTMState(jnp.zeros(self.d_size), jnp.zeros(self.d_size))
+        return LSTMState.empty(self.d_size)
 
     def act(
         self, state: State, memory: LSTMState, step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]

@@ -188,7 +188,7 @@ class VRMAgent(SACAgent):
     # Acting (Figure 2b)
 
     def reset(self, spec: Spec) -> Memory:
-        empty = LSTMState(jnp.zeros(self.d_size), jnp.zeros(self.d_size))
+        empty = LSTMState.empty(self.d_size)
         return Memory(empty if self.has_first else None, empty if self.has_keep else None)
 
     def perceive(

@@ -91,6 +91,11 @@ class LSTMState(NamedTuple):
     d: Float[Array, "*batch d"]  # its output, the recurrent state of the paper
     c: Float[Array, "*batch d"]  # its cell
 
+    @classmethod
+    def empty(cls, *shape: int) -> "LSTMState":
+        """The state at the start of an episode, leaves of this shape."""
+        return cls(jnp.zeros(shape), jnp.zeros(shape))
+
 
 class LSTMSlopes(NamedTuple):
     """Derivatives of one step of an LSTM, entry by entry."""
@@ -140,9 +145,8 @@ class LSTM(eqx.Module):
         self.bias = jnp.full((4 * d,), d**-0.5)
 
     def start(self, batch: int) -> LSTMState:
-        """The state at the start of an episode."""
-        zeros = jnp.zeros((batch, self.w_d.shape[0]))
-        return LSTMState(zeros, zeros)
+        """The state at the start of an episode, leaves (batch, d)."""
+        return LSTMState.empty(batch, self.w_d.shape[0])
 
     def unroll(
         self, start: LSTMState, x: Float[Array, "time batch input"], is_first: Bool[Array, "time batch"]
