@@ -10,7 +10,6 @@ from jaxtyping import Array, Bool, Float, Key
 from beliefrl import catalogue
 from beliefrl.agents.hyperparameters import build, values_before
 from beliefrl.catalogue import AGENT_GROUP as GROUP
-from beliefrl.catalogue import agent_names as names  # noqa: F401 - agents.names
 from beliefrl.imports import declared, declared_name, is_named, load, load_declared, path
 from beliefrl.models.nets import Gaussian
 from beliefrl.types import Spec, Timestep, UserError, Window, WindowShape, short
