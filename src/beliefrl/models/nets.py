@@ -1,8 +1,10 @@
-"""Building blocks of all networks: perceptrons, the gates of the LSTM, Gaussians with and without a tanh.
+"""Building blocks of all networks: perceptrons, the LSTM, Gaussians with and without a tanh, running statistics.
 
-All are written for one example, and the caller maps them over batches. The initialisation is PyTorch's: weights and
-biases are uniform in ±1/√fan_in, those of an LSTM in ±1/√size. A new module contains these bounds; `draw` replaces them
-by random weights.
+The perceptrons, `LSTM.step` and `tanh_gaussian` are written for one example, and the caller maps them over batches.
+`LSTM.unroll` and `update_statistics` take a batch. The other functions of Gaussians take arrays of any shape.
+
+The initialisation is PyTorch's: weights and biases are uniform in ±1/√fan_in, those of an LSTM in ±1/√size. A new
+module contains these bounds; `draw` replaces them by random weights.
 """
 
 import itertools
