@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import json
 from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Array, Bool, Float, Key
@@ -12,7 +11,7 @@ from beliefrl.agents.hyperparameters import build, values_before
 from beliefrl.catalogue import AGENT_GROUP as GROUP
 from beliefrl.imports import declared, declared_name, is_named, load, load_declared, path
 from beliefrl.models.nets import Gaussian
-from beliefrl.types import Spec, Timestep, UserError, Window, WindowShape, short
+from beliefrl.types import Spec, Timestep, UserError, Window, WindowShape, plain, short
 
 Metrics = dict[str, Float[Array, ""]]
 
@@ -126,7 +125,7 @@ AGENTS: dict[str, Any] = {name: load(known.path)(**known.hyperparameters) for na
 @functools.cache
 def defaults() -> dict[str, dict[str, Any]]:
     """The hyperparameters of each built-in name, in the form of JSON."""
-    return {name: json.loads(json.dumps(dataclasses.asdict(agent))) for name, agent in AGENTS.items()}
+    return {name: plain(dataclasses.asdict(agent)) for name, agent in AGENTS.items()}
 
 
 @functools.cache

@@ -67,7 +67,7 @@ class Training:
         folder = sweep / self.name
         if not (folder / "results.json").exists():
             return False
-        options = Options(**_typed(self.options, Options))
+        options = options_of(self)
         try:
             run = Run(folder)
             has_all_steps = ((run.results() or {}).get("step") or 0) >= self.steps
