@@ -25,7 +25,7 @@ from beliefrl.models.soft_actor_critic import (
     loss,
     update,
 )
-from beliefrl.types import LARGEST, WIDEST, Window, WindowShape, check_choice, check_range, transitions
+from beliefrl.types import LARGEST, WIDEST, UserError, Window, WindowShape, check_choice, check_range, transitions
 
 MOST_STEPS = 64  # of an n-step return; each step is compiled
 
@@ -127,6 +127,14 @@ class SACAgent(ControllerAgent):
         check_range(self, ("n_step",), 1, MOST_STEPS)
         check_range(self, ("updates_per_step",), 1)
         check_range(self, ("value_start",), -LARGEST)
+
+    def check_interval(self, name: str) -> None:
+        """Refuse an interval between two updates of a model that is no multiple of `train_interval_rl`."""
+        if getattr(self, name) % self.train_interval_rl:
+            raise UserError(
+                f"{name}={getattr(self, name)} is not a multiple of train_interval_rl={self.train_interval_rl}: "
+                "choose one that is."
+            )
 
     @property
     def cycle_updates(self) -> int:

@@ -122,11 +122,7 @@ class VRMAgent(SACAgent):
                 "store_state=True is impossible without a burn-in and a keep-learning model: "
                 "set burn_in to at least 1, and models to another value than 'first'."
             )
-        if self.train_interval_klvrm % self.train_interval_rl:
-            raise UserError(
-                f"train_interval_klvrm={self.train_interval_klvrm} is not a multiple of "
-                f"train_interval_rl={self.train_interval_rl}: choose one that is."
-            )
+        self.check_interval("train_interval_klvrm")
 
     # How it is trained
 
