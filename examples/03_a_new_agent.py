@@ -27,10 +27,10 @@ from beliefrl.types import Spec, Timestep, Window, WindowShape
 
 
 class State(NamedTuple):
-    """Everything that training changes."""
+    """Everything that training changes. `SACAgent.update` trains these two."""
 
     controller: Controller
-    optimiser: OptimiserState
+    controller_optimiser: OptimiserState
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,7 +65,7 @@ class StackAgent(SACAgent):
 
     def networks(self, state: State) -> State:
         """The state without its optimisers."""
-        return state._replace(optimiser=())
+        return state._replace(controller_optimiser=())
 
     def reset(self, spec: Spec) -> Float[Array, "stack obs"]:
         """The memory of an actor before its first timestep."""
@@ -82,7 +82,7 @@ class StackAgent(SACAgent):
         """Perceive a timestep, and choose an action."""
         older = jnp.where(step.is_first, jnp.broadcast_to(step.obs, memory.shape), memory)
         memory = jnp.concatenate([older[1:], step.obs[None]])
-        return self.choose(state.controller, memory.reshape(-1), key, explore), memory
+        return self.choose(state.controller.actor(memory.reshape(-1)), key, explore), memory
 
     def note(self, memory: Float[Array, "stack obs"]) -> tuple[()]:
         """What the replay stores with the timestep: nothing."""
@@ -113,11 +113,6 @@ class StackAgent(SACAgent):
     def begin_cycle(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Batch, Metrics]:
         """The batch of each update."""
         return state, self.batches(windows), {}
-
-    def update(self, state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
-        """One update of the controller."""
-        controller, optimiser, metrics = self.learn_controller(state.controller, state.optimiser, batch, key)
-        return State(controller, optimiser), metrics
 
 
 def main(quick: bool = False) -> None:

@@ -15,7 +15,7 @@ import sys
 import pytest
 
 import beliefrl
-from beliefrl import agents, catalogue, tasks
+from beliefrl import catalogue, tasks
 from beliefrl.cli import COMMANDS, main
 from beliefrl.types import UserError
 
@@ -51,7 +51,7 @@ def test_a_page_names_commands_and_options_that_exist(page):
         options = {word.partition("=")[0] for word in words if word.startswith("--")} - {"--help"}
         named = [word for word in words[:1] if re.fullmatch(r"[a-z][\w-]*", word)]
         if command in ("train", "bench") and named:
-            assert named[0] in (*agents.names(), *(["all"] if command == "bench" else []))
+            assert named[0] in (*catalogue.agent_names(), *(["all"] if command == "bench" else []))
         if command in ("train", "bench") and ":" in "".join(words[:1]):
             named = ["worlds:CountingAgent"]  # for the page's own, which is in no file here
         if command == "train":
@@ -143,7 +143,7 @@ def test_the_ranges_on_the_page_of_tasks_are_those_of_the_code(name, constant, u
 
 def test_the_page_of_agents_has_every_agent():
     text = (DOCS / "agents" / "README.md").read_text()
-    assert all(f"`{name}`" in text for name in agents.names())
+    assert all(f"`{name}`" in text for name in catalogue.agent_names())
 
 
 def test_every_public_name_is_in_the_api():

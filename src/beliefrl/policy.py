@@ -81,7 +81,7 @@ class Policy:
         return action, *after
 
     def _act_with(self, obs, reward, state, episode_start, keys, explore):
-        """The same with a random key for each episode, or one key for all of them."""
+        """`_step`, given a random key for each episode, or one key for all of them."""
         *memory, prev_action = state
         memory = jax.tree.structure(self._empty).unflatten(memory)
         memory = jax.tree.map(functools.partial(_where_first, episode_start), self._empty, memory)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from beliefrl import agents
+from beliefrl import agents, catalogue
 from beliefrl.models.window_loss import model_loss
 from beliefrl.training import phases
 from beliefrl.types import Spec, UserError, perception
@@ -118,7 +118,7 @@ def test_a_deterministic_models_gradient_agrees_with_finite_differences(determin
 
 
 def test_names_find_their_agents_and_agents_their_names():
-    for name in agents.names():
+    for name in catalogue.agent_names():
         agent = agents.make(name, gamma=0.5)
         assert agents.name_of(agent) == name
         assert agents.make(name, **dataclasses.asdict(agent)) == agent

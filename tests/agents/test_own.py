@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from beliefrl import agents
+from beliefrl import agents, catalogue
 from beliefrl.agents import hyperparameters, named
 from beliefrl.agents.predictive_sac import PredictiveSACAgent
 from beliefrl.agents.sac_mlp import SACMLPAgent
@@ -70,7 +70,7 @@ def recorded(agent):
 
 def test_an_agent_is_made_by_the_path_of_its_class():
     assert agents.make(OWN, cycle=6) == CountingAgent(cycle=6)
-    assert agents.find(OWN) == CountingAgent()
+    assert agents.make(OWN) == CountingAgent()
     assert agents.name_of(CountingAgent()) == OWN
     assert agents.name_of(agents.make("beliefrl.agents.sac_mlp:SACMLPAgent")) == "sac-mlp"
 
@@ -142,8 +142,8 @@ def test_whose_class_a_name_is_of():
 
 def test_an_entry_point_is_an_agents_name(tmp_path, monkeypatch):
     installed(tmp_path, monkeypatch, "beliefrl.agents", counting=OWN, vrm=OWN, broken="nowhere:Agent")
-    assert agents.names()["counting"].startswith(OWN)
-    assert agents.names()["vrm"] != agents.names()["counting"]
+    assert catalogue.agent_names()["counting"].startswith(OWN)
+    assert catalogue.agent_names()["vrm"] != catalogue.agent_names()["counting"]
     assert agents.make("counting", cycle=6) == CountingAgent(cycle=6)
     assert agents.name_of(CountingAgent()) == "counting"
     assert agents.is_of(CountingAgent, "counting")

@@ -287,7 +287,7 @@ def test_standardised_beliefs_are_what_the_controller_learns_from_and_acts_on(st
     step, mode = jax.tree.map(lambda leaf: leaf[0, 0], window.step), jnp.array(False)
     action, memory = jax.jit(agent.act)(after, agent.reset(SPEC), step, jax.random.key(3), mode)
     belief = standardise(after.scale, jnp.concatenate([memory.first.d, memory.keep.d, step.obs, step.reward[None]]))
-    np.testing.assert_allclose(action, agent.choose(after.controller, belief, jax.random.key(3), mode), rtol=1e-5)
+    np.testing.assert_allclose(action, agent.choose(after.controller.actor(belief), jax.random.key(3), mode), rtol=1e-5)
 
 
 @pytest.mark.slow

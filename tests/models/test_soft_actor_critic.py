@@ -11,9 +11,9 @@ import pytest
 
 from beliefrl.models import double_q
 from beliefrl.models import soft_actor_critic as sac
-from beliefrl.models.double_q import Policy, Samples, Unit, init_optimisers
+from beliefrl.models.double_q import Policy, Samples, Unit
 from beliefrl.models.nets import tanh_gaussian
-from beliefrl.models.soft_actor_critic import Actor, Batch, Optimisers
+from beliefrl.models.soft_actor_critic import Actor, Batch, Optimisers, init_optimisers
 from beliefrl.types import Timestep
 
 BELIEF, ACTION, ROWS = 5, 2, 6
@@ -151,7 +151,7 @@ def test_every_group_has_its_optimiser_and_the_target_follows_the_new_value(cont
     optimisers = Optimisers(*(optax.sgd(RATES[name]) for name in Optimisers._fields))
     gradient = jax.tree.map(jnp.ones_like, controller)
     step = jax.jit(
-        lambda: sac.update(optimisers, sac.init_optimisers(optimisers, controller), controller, gradient, 0.1)
+        lambda: sac.update(optimisers, init_optimisers(optimisers, controller.trained), controller, gradient, 0.1)
     )
     after, _ = step()
 
@@ -370,7 +370,7 @@ def test_what_is_learned_does_not_depend_on_the_size_of_rewards(size, likelihood
 
     @jax.jit
     def learn(controller, data):
-        state = init_optimisers(optimisers, controller)
+        state = init_optimisers(optimisers, controller.trained)
         for number in range(5):
             key = jax.random.key(number)
             settings = {"tau": 0.1, "regulariser": 1e-3, "pessimism": 1.0, "likelihood": likelihood}
@@ -396,7 +396,7 @@ def test_an_update_moves_the_targets_by_tau_and_ignores_what_is_not_valid(likeli
     @jax.jit
     def update(data):
         settings = {"tau": 0.25, "regulariser": 1e-3, "pessimism": 1.0, "likelihood": likelihood}
-        state = init_optimisers(optimisers, controller)
+        state = init_optimisers(optimisers, controller.trained)
         return double_q.update(optimisers, state, controller, data, KEY, **settings)[0]
 
     after, same = update(data), update(other)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from beliefrl import agents
+from beliefrl import catalogue
 from beliefrl.analysis.panels import AGENTS, colours
 from beliefrl.report import write_report
 from beliefrl.report.data import statistics
@@ -198,7 +198,7 @@ def test_a_page_that_cannot_be_written_is_refused(tmp_path, out, message):
 
 
 def test_every_agent_has_a_colour_of_its_own():
-    assert set(agents.names()) == set(AGENTS)
+    assert set(catalogue.agent_names()) == set(AGENTS)
     assert len(set(AGENTS.values())) == len(AGENTS)
     assert colours(["other", "slac", "vrm"])["slac"] == colours(["slac"])["slac"] == AGENTS["slac"]
 

@@ -49,7 +49,7 @@ def test_the_ranges_of_every_agent_are_possible(name, end):
 
 def test_drawn_numbers_lie_in_their_range_and_have_few_digits():
     given = {"gamma": Range(0.9, 0.99), "lr_actor": Range(1.234567e-4, 2.345678e-4), "d_size": Range(10, 20)}
-    found = ranges.chosen(agents.find("vrm"), "vrm", given, only=["gamma", "lr_actor", "d_size"])
+    found = ranges.chosen(agents.make("vrm"), "vrm", given, only=["gamma", "lr_actor", "d_size"])
     assert [found[name].scale for name in ("gamma", "lr_actor", "d_size")] == ["horizon", "log", "linear"]
     low, high = (ranges.draw(ends_at(end), found) for end in (0, 1))
     assert low == {"gamma": 0.99, "lr_actor": 1.235e-4, "d_size": 10}  # the lowest 1 - gamma

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from beliefrl import agents, cli, evaluate, load, play, resume, tasks, train
+from beliefrl import agents, catalogue, cli, evaluate, load, play, resume, tasks, train
 from beliefrl.agents.base import SACAgent
 from beliefrl.agents.vrm import VRMAgent
 from beliefrl.training import compilation, phases
@@ -264,10 +264,10 @@ def test_bench_all_prints_the_scalability_table(monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "120")
     cli.main(["bench", "all", "--obs", "4", "--actions", "2", "--seeds", "3"])
     lines = capsys.readouterr().out.splitlines()
-    for name in agents.names():
+    for name in catalogue.agent_names():
         assert any(name in line and "12.5" in line and "20:50" in line and "50%" in line for line in lines)
     cli.main(["bench", "all", "--obs", "4", "--actions", "2", "--seeds", "3", "--json"])
-    assert set(json.loads(capsys.readouterr().out)) == set(agents.names())
+    assert set(json.loads(capsys.readouterr().out)) == set(catalogue.agent_names())
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from beliefrl import agents, tasks
+from beliefrl import agents, catalogue, tasks
 from beliefrl.training import phases, rounding
 from beliefrl.training.rounding import SMALLEST, at_precision, rounded
 from inputs import same
@@ -166,7 +166,7 @@ def test_products_of_seeds_side_by_side_are_those_of_one_seed(name):
     np.testing.assert_allclose(compiled(jax.vmap(rounded(product), (0, None)))(A, B[0]), jnp.stack(alone), atol=1e-5)
 
 
-@pytest.mark.parametrize("name", agents.names())
+@pytest.mark.parametrize("name", catalogue.agent_names())
 @pytest.mark.parametrize("precision", ["float32", "tensorfloat32", "bfloat16"])
 def test_every_large_product_of_an_agents_learning_is_rounded_if_asked(name, precision):
     agent, task = agents.make(name), tasks.make("pendulum-v")

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import json
 from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Array, Bool, Float, Key
@@ -10,10 +9,9 @@ from jaxtyping import Array, Bool, Float, Key
 from beliefrl import catalogue
 from beliefrl.agents.hyperparameters import build, values_before
 from beliefrl.catalogue import AGENT_GROUP as GROUP
-from beliefrl.catalogue import agent_names as names  # noqa: F401 - agents.names
 from beliefrl.imports import declared, declared_name, is_named, load, load_declared, path
 from beliefrl.models.nets import Gaussian
-from beliefrl.types import Spec, Timestep, UserError, Window, WindowShape, short
+from beliefrl.types import Spec, Timestep, UserError, Window, WindowShape, plain, short
 
 Metrics = dict[str, Float[Array, ""]]
 
@@ -127,7 +125,7 @@ AGENTS: dict[str, Any] = {name: load(known.path)(**known.hyperparameters) for na
 @functools.cache
 def defaults() -> dict[str, dict[str, Any]]:
     """The hyperparameters of each built-in name, in the form of JSON."""
-    return {name: json.loads(json.dumps(dataclasses.asdict(agent))) for name, agent in AGENTS.items()}
+    return {name: plain(dataclasses.asdict(agent)) for name, agent in AGENTS.items()}
 
 
 @functools.cache
@@ -166,16 +164,6 @@ def check_class(kind: type) -> type:
     if lacks:
         raise UserError(f"{path(kind)} is no agent: it lacks {', '.join(lacks)} (see beliefrl.Agent).")
     return kind
-
-
-def find(name: str) -> Any:
-    """The agent of that name with the hyperparameters that belong to this name; see `find_class`.
-
-    Raises:
-        UserError: no agent has that name, or the class is not an agent, or a hyperparameter has no default.
-    """
-    agent = named(name)
-    return build(agent, {}, name) if isinstance(agent, type) else agent
 
 
 def make(name: str, /, **hyperparameters: Any) -> Agent:

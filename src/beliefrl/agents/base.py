@@ -25,7 +25,7 @@ from beliefrl.models.soft_actor_critic import (
     loss,
     update,
 )
-from beliefrl.types import LARGEST, WIDEST, Window, WindowShape, check_choice, check_range, transitions
+from beliefrl.types import LARGEST, WIDEST, UserError, Window, WindowShape, check_choice, check_range, transitions
 
 MOST_STEPS = 64  # of an n-step return; each step is compiled
 
@@ -97,21 +97,11 @@ class ControllerAgent:
 
     def choose(
         self,
-        controller: Any,
-        actor_input: Float[Array, " actor_input"],
-        key: Key[Array, ""],
-        explore: Bool[Array, ""],
-    ) -> Float[Array, " action"]:
-        """An action: a sample of the policy, or its mode if not `explore`."""
-        return self.choose_from(controller.actor(actor_input), key, explore)
-
-    def choose_from(
-        self,
         policy: tuple[Float[Array, " action"], Float[Array, " action"]],
         key: Key[Array, ""],
         explore: Bool[Array, ""],
     ) -> Float[Array, " action"]:
-        """An action of a policy with this μ and log σ."""
+        """An action of the policy with this μ and log σ: a sample, or its mode if not `explore`."""
         mean, log_sigma = policy
         noise = jnp.where(explore, jax.random.normal(key, mean.shape), 0.0)
         return tanh_gaussian(mean, log_sigma, noise)[0]
@@ -137,6 +127,14 @@ class SACAgent(ControllerAgent):
         check_range(self, ("n_step",), 1, MOST_STEPS)
         check_range(self, ("updates_per_step",), 1)
         check_range(self, ("value_start",), -LARGEST)
+
+    def check_interval(self, name: str) -> None:
+        """Refuse an interval between two updates of a model that is no multiple of `train_interval_rl`."""
+        if getattr(self, name) % self.train_interval_rl:
+            raise UserError(
+                f"{name}={getattr(self, name)} is not a multiple of train_interval_rl={self.train_interval_rl}: "
+                "choose one that is."
+            )
 
     @property
     def cycle_updates(self) -> int:
@@ -174,7 +172,7 @@ class SACAgent(ControllerAgent):
         """A new controller and its optimisers; `actor_size` is the actor's input size if it is not the belief."""
         sizes = belief, action, self.policy_layers, self.value_layers
         controller = init_controller(*sizes, key, actor_size, self.value_start)
-        return controller, init_optimisers(self.optimisers, controller)
+        return controller, init_optimisers(self.optimisers, controller.trained)
 
     def controller_loss(
         self, controller: Controller, batch: Batch, key: Key[Array, ""]
@@ -183,17 +181,11 @@ class SACAgent(ControllerAgent):
         noise = jax.random.normal(key, batch.action.shape)
         return loss(controller, batch, noise, self.actor_regulariser, self.target_entropy)
 
-    def learn_controller(
-        self, controller: Controller, state: OptimiserState, batch: Batch, key: Key[Array, ""]
-    ) -> tuple[Controller, OptimiserState, Metrics]:
-        """One update on transitions whose beliefs are given."""
-        gradient, metrics = jax.grad(self.controller_loss, has_aux=True)(controller, batch, key)
-        controller, state = update(self.optimisers, state, controller, gradient, self.tau)
-        return controller, state, metrics
-
     def update(self, state: Any, batch: Any, key: Key[Array, ""]) -> tuple[Any, Metrics]:
         """One update of the controller, of a state with `controller` and `controller_optimiser`."""
-        controller, optimiser, metrics = self.learn_controller(state.controller, state.controller_optimiser, batch, key)
+        controller, optimiser = state.controller, state.controller_optimiser
+        gradient, metrics = jax.grad(self.controller_loss, has_aux=True)(controller, batch, key)
+        controller, optimiser = update(self.optimisers, optimiser, controller, gradient, self.tau)
         return state._replace(controller=controller, controller_optimiser=optimiser), metrics
 
 

@@ -38,7 +38,7 @@ from beliefrl.models.nets import Gaussian, LSTMState, descend, falling_rate, sta
 from beliefrl.models.pool import Pool
 from beliefrl.models.predictive_model import PredictiveModel, init_model, prediction_loss
 from beliefrl.models.scales import Scales, initial_scales
-from beliefrl.models.soft_actor_critic import OptimiserState, valid_mean
+from beliefrl.models.soft_actor_critic import OptimiserState, init_optimisers, valid_mean
 from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range
 
 
@@ -211,7 +211,7 @@ class PredictiveSACAgent(ControllerAgent):
             model.lstm.start(self.window.readers),
             pool.empty((self.pool, self.sequences * self.seq_len), belief, spec.action_dim),
             self.model_optimiser.init(model),  # pyright: ignore[reportArgumentType]
-            double_q.init_optimisers(self.optimisers, controller),
+            init_optimisers(self.optimisers, controller.trained),
             average.begin((model, controller.actor)),
         )
 
@@ -235,7 +235,7 @@ class PredictiveSACAgent(ControllerAgent):
         memory, x = perceive(state.model, state.scales, memory, step, self.perceived)
         belief = jnp.concatenate([memory.lstm.d, x])
         policy = state.controller.actor(standardise(state.scales.belief, belief))
-        return self.choose_from(policy, key, explore), memory._replace(note=memory.note._replace(policy=policy))
+        return self.choose(policy, key, explore), memory._replace(note=memory.note._replace(policy=policy))
 
     def note(self, memory: Memory) -> Note:
         return memory.note

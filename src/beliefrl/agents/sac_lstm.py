@@ -114,13 +114,13 @@ class SACLSTMAgent(SACAgent):
         return jnp.concatenate(parts, axis=-1)
 
     def reset(self, spec: Spec) -> LSTMState:
-        return LSTMState(jnp.zeros(self.d_size), jnp.zeros(self.d_size))
+        return LSTMState.empty(self.d_size)
 
     def act(
         self, state: State, memory: LSTMState, step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]
     ) -> tuple[Float[Array, " action"], LSTMState]:
         memory = state.lstm.step(memory, self.perception(step), step.is_first)
-        return self.choose(state.controller, memory.d, key, explore), memory
+        return self.choose(state.controller.actor(memory.d), key, explore), memory
 
     def note(self, memory: LSTMState) -> tuple[()]:
         return ()

@@ -71,7 +71,8 @@ class SACMLPAgent(SACAgent):
     def act(
         self, state: State, memory: tuple[()], step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]
     ) -> tuple[Float[Array, " action"], tuple[()]]:
-        return self.choose(state.controller, standardise(state.scale, step.obs), key, explore), memory
+        policy = state.controller.actor(standardise(state.scale, step.obs))
+        return self.choose(policy, key, explore), memory
 
     def note(self, memory: tuple[()]) -> tuple[()]:
         return ()

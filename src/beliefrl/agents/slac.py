@@ -23,7 +23,7 @@ from beliefrl.agents.base import Range, SACAgent, split_updates
 from beliefrl.models.latent_model import LatentModel, Latents, elbo_terms, predict
 from beliefrl.models.nets import Gaussian, descend, draw
 from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean
-from beliefrl.types import WIDEST, Spec, Timestep, UserError, Window, WindowShape, check_choice, check_range, perception
+from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_choice, check_range, perception
 
 
 class State(NamedTuple):
@@ -78,11 +78,7 @@ class SLACAgent(SACAgent):
         check_range(self, ("pretrain_updates",), 0)
         check_range(self, ("lr_model",), 0, 1)
         check_choice(self, "elbo_scaling", ("mean", "sum"))
-        if self.train_interval_model % self.train_interval_rl:
-            raise UserError(
-                f"train_interval_model={self.train_interval_model} is not a multiple of "
-                f"train_interval_rl={self.train_interval_rl}: choose one that is."
-            )
+        self.check_interval("train_interval_model")
 
     # How it is trained
 
@@ -141,7 +137,7 @@ class SLACAgent(SACAgent):
     ) -> tuple[Float[Array, " action"], Float[Array, "history x"]]:
         x = perception(step)
         memory = jnp.where(step.is_first, x[None], jnp.concatenate([memory[1:], x[None]]))
-        return self.choose(state.controller, memory.ravel(), key, explore), memory
+        return self.choose(state.controller.actor(memory.ravel()), key, explore), memory
 
     def note(self, memory: Float[Array, "history x"]) -> tuple[()]:
         return ()

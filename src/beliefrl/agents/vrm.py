@@ -122,11 +122,7 @@ class VRMAgent(SACAgent):
                 "store_state=True is impossible without a burn-in and a keep-learning model: "
                 "set burn_in to at least 1, and models to another value than 'first'."
             )
-        if self.train_interval_klvrm % self.train_interval_rl:
-            raise UserError(
-                f"train_interval_klvrm={self.train_interval_klvrm} is not a multiple of "
-                f"train_interval_rl={self.train_interval_rl}: choose one that is."
-            )
+        self.check_interval("train_interval_klvrm")
 
     # How it is trained
 
@@ -188,7 +184,7 @@ class VRMAgent(SACAgent):
     # Acting (Figure 2b)
 
     def reset(self, spec: Spec) -> Memory:
-        empty = LSTMState(jnp.zeros(self.d_size), jnp.zeros(self.d_size))
+        empty = LSTMState.empty(self.d_size)
         return Memory(empty if self.has_first else None, empty if self.has_keep else None)
 
     def perceive(
@@ -212,7 +208,8 @@ class VRMAgent(SACAgent):
             self.perceive(state.keep, memory.keep, step, key_keep, explore),
         )
         belief = jnp.concatenate([*(part.d for part in memory if part is not None), perception(step)])
-        return self.choose(state.controller, standardise(state.scale, belief), key_action, explore), memory
+        policy = state.controller.actor(standardise(state.scale, belief))
+        return self.choose(policy, key_action, explore), memory
 
     def note(self, memory: Memory) -> tuple[Float[Array, " d"], ...]:
         """d_t of the first-impression model, then the state of the keep-learning model, if they are stored."""

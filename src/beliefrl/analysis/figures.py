@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from beliefrl.analysis.groups import Group, task_of
+from beliefrl.analysis.groups import Group, task_label
 from beliefrl.runs.given_files import check_folder, write_given
 from beliefrl.runs.run import Run
 from beliefrl.types import UserError
@@ -102,7 +102,7 @@ def curve_figure(run: Run) -> Any:
     Raises:
         UserError: there is no evaluation yet.
     """
-    group = Group(task_of(run), run.config["agent"], [(run, seed) for seed in run.seeds])
+    group = Group(task_label(run), run.config["agent"], [(run, seed) for seed in run.seeds])
     if not group.curve("sampled").steps.size:
         raise UserError(f"{run.folder} has no evaluation of every seed yet, so there is no curve to draw.")
     panels = ["", *group.measures]

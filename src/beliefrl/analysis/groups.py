@@ -195,8 +195,8 @@ def groups(
     seeds: dict[tuple[str, str], dict[int, Run]] = {}
     for run in runs:
         same_agent = [settings[other.folder] for other in runs if other.config["agent"] == run.config["agent"]]
-        same_task = [other.config["constants"] for other in runs if task_of(other) == task_of(run)]
-        task = " ".join([task_of(run), *_differences(run.config["constants"], same_task)])
+        same_task = [other.config["constants"] for other in runs if task_label(other) == task_label(run)]
+        task = " ".join([task_label(run), *_differences(run.config["constants"], same_task)])
         own = results.changed(settings[run.folder], usual[run.config["agent"]])
         label = " ".join([run.config["agent"], *_differences(own, same_agent), *_options(run)])
         of = seeds.setdefault((task, label), {})
@@ -240,7 +240,7 @@ def _precedence(run: Run, seed: int) -> tuple[int, str]:
     return last_step(run, seed), str(run.config.get("started", ""))
 
 
-def task_of(run: Run) -> str:
+def task_label(run: Run) -> str:
     """The name of a task in figures. It includes selected entries, faults and action repeat, if there are any."""
     seen = run.config.get("observe")
     observed = ["observe", *map(str, seen)] if seen else []

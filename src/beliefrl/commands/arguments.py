@@ -112,6 +112,17 @@ OwnAgent = Annotated[
         help="The class of the agent, where an agent of your own was trained. Its module is imported.",
     ),
 ]
+RunFolder = Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="RUN", help="The run's folder.")]
+RunFolders = Annotated[
+    tyro.conf.Positional[tuple[pathlib.Path, ...]],
+    tyro.conf.arg(
+        metavar="RUNS",
+        help="Folders of runs, folders that contain runs (such as a sweep's), or files of results, NAME.json.gz.",
+        help_behavior_hint="(required)",
+    ),
+]
+Seed = Annotated[int | None, tyro.conf.arg(help="One of the run's seeds. None: its first.")]
+Sampled = Annotated[bool, tyro.conf.arg(help="Sample the actions, instead of taking the policy's mode.")]
 Out = Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])]
 Best = Annotated[
     bool,

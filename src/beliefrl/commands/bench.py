@@ -29,7 +29,7 @@ def bench(argv: Sequence[str]) -> None:
         "precision": option(Precision, "float32", "Precision of matrix products, as in a training."),
         "json": option(bool, False, "Print one JSON object."),
     }
-    options = parse(agent_options(None if name == "all" else agents.find(name), own), rest, f"beliefrl bench {name}")
+    options = parse(agent_options(None if name == "all" else agents.make(name), own), rest, f"beliefrl bench {name}")
     from beliefrl.training.bench import bench as run_bench
 
     given = (options.obs, options.actions, options.seeds, options.precision)

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from beliefrl.commands.arguments import Out, parse
+from beliefrl.commands.arguments import Out, RunFolders, parse
 from beliefrl.errors import UserError
 
 KINDS = ("curves", "run", "ablation", "sensitivity", "elbo", "aggregate", "scalability", "table")
@@ -33,10 +33,7 @@ RUNS are folders of runs, folders that contain runs (such as a sweep's), or file
 class FigureOptions:
     """Draw a figure from finished runs, as PNG and PDF."""
 
-    runs: Annotated[
-        tyro.conf.Positional[tuple[pathlib.Path, ...]], tyro.conf.arg(metavar="RUNS", help_behavior_hint="(required)")
-    ]
-    """Folders of runs, folders that contain runs (such as a sweep's), or files of results, NAME.json.gz."""
+    runs: RunFolders
     out: Out = None
     """The file to write, with or without the suffix. None: KIND in the current folder. Figures are written as .png and
     .pdf, tables as .md and .tex."""
@@ -136,10 +133,7 @@ def _is_chosen(run: Any, options: FigureOptions, kind: str) -> bool:
 class ReportOptions:
     """Write a report on runs as one HTML page: curves, final returns, settings, time. It needs no network."""
 
-    runs: Annotated[
-        tyro.conf.Positional[tuple[pathlib.Path, ...]], tyro.conf.arg(metavar="RUNS", help_behavior_hint="(required)")
-    ]
-    """Folders of runs, folders that contain runs (such as a sweep's), or files of results, NAME.json.gz."""
+    runs: RunFolders
     out: Annotated[pathlib.Path, tyro.conf.arg(aliases=["-o"])] = pathlib.Path("report.html")
     """The page to write. An existing file is replaced. Links to videos are relative to the page's folder."""
     unfinished: bool = False

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from beliefrl.commands.arguments import Best, Out, OwnAgent, own_agent, parse
+from beliefrl.commands.arguments import Best, Out, OwnAgent, RunFolder, Sampled, Seed, own_agent, parse
 
 SPARING = 20.0  # maximum frames per second of a demo's video, so that it is written in seconds
 
@@ -20,8 +20,7 @@ SPARING = 20.0  # maximum frames per second of a demo's video, so that it is wri
 class PredictOptions:
     """Compare the predictions of a run's model with a true episode: open loop and closed loop, with σ."""
 
-    run: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="RUN")]
-    """The run's folder."""
+    run: RunFolder
     out: Out = None
     """The picture to write, as PNG and as PDF. None: predictions.png in the run's folder."""
     model: str | None = None
@@ -35,12 +34,10 @@ class PredictOptions:
     """Number of samples in the mean of each prediction."""
     entries: tuple[int, ...] = ()
     """Entries of the observation to draw, numbered as in --observe. Empty: the first six that the agent sees."""
-    seed: int | None = None
-    """One of the run's seeds. None: its first."""
+    seed: Seed = None
     episode_seed: int = 0
     """Random seed of the episode, its actions and the samples. The same seed gives the same picture."""
-    sampled: bool = False
-    """Sample the actions, instead of taking the policy's mode."""
+    sampled: Sampled = False
     best: Best = False
     agent: OwnAgent = None
 
@@ -49,8 +46,7 @@ class PredictOptions:
 class VideoOptions:
     """Record a video of a run's trained agent."""
 
-    run: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="RUN")]
-    """The run's folder."""
+    run: RunFolder
     out: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="FILE")]
     """The video to write, .mp4 (needs the extra `video`) or .gif. An existing file is replaced."""
     episodes: int = 1
@@ -59,12 +55,10 @@ class VideoOptions:
     """Timesteps per second of the video. None: real time, with at most 50 frames per second."""
     steps: int | None = None
     """Stop each episode after this many steps. None: play until the task ends it."""
-    seed: int | None = None
-    """One of the run's seeds. None: its first."""
+    seed: Seed = None
     episode_seed: int = 0
     """Random seed of the first episode. The next episodes have the following seeds."""
-    sampled: bool = False
-    """Sample the actions, instead of taking the policy's mode."""
+    sampled: Sampled = False
     best: Best = False
     agent: OwnAgent = None
 
@@ -89,8 +83,7 @@ class FilmOptions:
     """One of each run's seeds. None: its first."""
     episode_seed: int = 0
     """Random seed of the episodes. The same seed gives the same strip."""
-    sampled: bool = False
-    """Sample the actions, instead of taking the policy's mode."""
+    sampled: Sampled = False
     best: Best = False
     agent: OwnAgent = None
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from beliefrl.commands.arguments import Best, OwnAgent, named_values, own_agent, parse
+from beliefrl.commands.arguments import Best, OwnAgent, RunFolder, Seed, named_values, own_agent, parse
 
 if TYPE_CHECKING:
     from beliefrl.runs.run import Run
@@ -20,8 +20,7 @@ if TYPE_CHECKING:
 class EvaluateOptions:
     """Evaluate a run's trained agent in new episodes, with sampled actions and with mode actions."""
 
-    run: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="RUN")]
-    """The run's folder."""
+    run: RunFolder
     episodes: int = 20
     """Number of episodes for each of the run's seeds and each kind of actions (sampled, mode)."""
     seed: int = 0
@@ -41,12 +40,10 @@ class EvaluateOptions:
 class ExportOptions:
     """Write a run's policy to one file that runs without this library (`beliefrl.Policy.export`)."""
 
-    run: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="RUN")]
-    """The run's folder."""
+    run: RunFolder
     file: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="FILE")]
     """The file to write. NAME.onnx is an ONNX model (needs the extra `onnx`); any other name is for jax.export."""
-    seed: int | None = None
-    """One of the run's seeds. None: its first."""
+    seed: Seed = None
     best: Best = False
     overwrite: bool = False
     """Replace an existing file."""
@@ -57,8 +54,7 @@ class ExportOptions:
 class ShowOptions:
     """Show the settings, the progress and the results of a run."""
 
-    run: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="RUN")]
-    """The run's folder."""
+    run: RunFolder
 
 
 def show(argv: Sequence[str]) -> None:

@@ -10,6 +10,7 @@ import tyro
 from beliefrl import catalogue
 from beliefrl.commands.arguments import (
     OwnAgent,
+    RunFolder,
     agent_name,
     agent_options,
     named_values,
@@ -57,8 +58,7 @@ class CheckOptions:
 class ResumeOptions:
     """Continue a training from its last checkpoint, or from step 0 if it has none yet. Other settings cannot change."""
 
-    run: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="RUN")]
-    """The run's folder."""
+    run: RunFolder
     steps: int | None = None
     """Total number of environment steps of each seed, at least as many as before. None: as many as before."""
     stop_at: NewLimit = "same"
@@ -97,7 +97,7 @@ def train(argv: Sequence[str]) -> None:
     from beliefrl.training.train import train as run_training
 
     options_type = agent_options(
-        agents.find(name),
+        agents.make(name),
         {
             "task": (TaskName, dataclasses.MISSING),
             "observe": (Observe, ()),

@@ -37,7 +37,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.models.nets import MLP, descend, draw, gaussian_log_prob, tanh_gaussian
+from beliefrl.models.nets import MLP, draw, gaussian_log_prob, tanh_gaussian
 from beliefrl.models.returns import lambda_returns
 from beliefrl.models.soft_actor_critic import (
     LOG_SIGMA_MAX,
@@ -47,6 +47,7 @@ from beliefrl.models.soft_actor_critic import (
     alpha_loss,
     q_outputs,
     soft_update,
+    step_all,
     valid_mean,
     wanted_entropy,
 )
@@ -108,14 +109,10 @@ class DoubleQController(NamedTuple):
     log_alpha: Float[Array, ""]
     unit: Unit
 
-
-def init_optimisers(optimisers: Optimisers, controller: DoubleQController) -> OptimiserState:
-    """Fresh states for `update`."""
-    return OptimiserState(
-        optimisers.actor.init(controller.actor),  # pyright: ignore[reportArgumentType]
-        optimisers.critic.init(controller.critics),  # pyright: ignore[reportArgumentType]
-        optimisers.alpha.init(controller.log_alpha),
-    )
+    @property
+    def trained(self) -> tuple[OneTrunkActor, tuple[MLP, MLP], Float[Array, ""]]:
+        """The parameters of each optimiser, in the order of `Optimisers`."""
+        return self.actor, self.critics, self.log_alpha
 
 
 def init_controller(
@@ -278,9 +275,8 @@ def update(
     (j_pi, (q, log_prob)), grad_actor = differentiate(controller.actor, controller, batch, key, regulariser, pessimism)
     entropy = wanted_entropy(batch.action, target_entropy)
     grad_alpha = jax.grad(alpha_loss)(controller.log_alpha, log_prob, batch.valid, entropy)
-    actor, s_actor = descend(optimisers.actor, grad_actor, state.actor, controller.actor)
-    critics, s_critics = descend(optimisers.critic, grad_critics, state.critic, controller.critics)
-    log_alpha, s_alpha = descend(optimisers.alpha, grad_alpha, state.alpha, controller.log_alpha)
+    gradient = grad_actor, grad_critics, grad_alpha
+    (actor, critics, log_alpha), state = step_all(optimisers, state, controller.trained, gradient)
     metrics = {
         "loss_q": j_q,
         "loss_actor": j_pi,
@@ -290,8 +286,4 @@ def update(
         "unit": controller.unit.u,
     }
     targets = soft_update(controller.targets, critics, tau)
-    return (
-        DoubleQController(actor, critics, targets, log_alpha, controller.unit),
-        OptimiserState(s_actor, s_critics, s_alpha),
-        metrics,
-    )
+    return DoubleQController(actor, critics, targets, log_alpha, controller.unit), state, metrics

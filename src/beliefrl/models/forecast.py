@@ -47,7 +47,7 @@ def no_memory(d: int, obs: int, action: int, perceived: Perceived) -> Memory:
     """The memory before an episode, given the sizes of the LSTM's state, the observation and the action."""
     observations = jnp.zeros((obs, len(perceived.observations))) if perceived.observations else None
     note = Note(jnp.zeros(len(perceived.rewards)), Policy(*jnp.zeros((2, action))), observations)
-    return Memory(LSTMState(*jnp.zeros((2, d))), note)
+    return Memory(LSTMState.empty(d), note)
 
 
 def perceive(

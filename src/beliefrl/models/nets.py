@@ -1,8 +1,10 @@
-"""Building blocks of all networks: perceptrons, the gates of the LSTM, Gaussians with and without a tanh.
+"""Building blocks of all networks: perceptrons, the LSTM, Gaussians with and without a tanh, running statistics.
 
-All are written for one example, and the caller maps them over batches. The initialisation is PyTorch's: weights and
-biases are uniform in ±1/√fan_in, those of an LSTM in ±1/√size. A new module contains these bounds; `draw` replaces them
-by random weights.
+The perceptrons, `LSTM.step` and `tanh_gaussian` are written for one example, and the caller maps them over batches.
+`LSTM.unroll` and `update_statistics` take a batch. The other functions of Gaussians take arrays of any shape.
+
+The initialisation is PyTorch's: weights and biases are uniform in ±1/√fan_in, those of an LSTM in ±1/√size. A new
+module contains these bounds; `draw` replaces them by random weights.
 """
 
 import itertools
@@ -91,6 +93,11 @@ class LSTMState(NamedTuple):
     d: Float[Array, "*batch d"]  # its output, the recurrent state of the paper
     c: Float[Array, "*batch d"]  # its cell
 
+    @classmethod
+    def empty(cls, *shape: int) -> "LSTMState":
+        """The state at the start of an episode, leaves of this shape."""
+        return cls(jnp.zeros(shape), jnp.zeros(shape))
+
 
 class LSTMSlopes(NamedTuple):
     """Derivatives of one step of an LSTM, entry by entry."""
@@ -140,9 +147,8 @@ class LSTM(eqx.Module):
         self.bias = jnp.full((4 * d,), d**-0.5)
 
     def start(self, batch: int) -> LSTMState:
-        """The state at the start of an episode."""
-        zeros = jnp.zeros((batch, self.w_d.shape[0]))
-        return LSTMState(zeros, zeros)
+        """The state at the start of an episode, leaves (batch, d)."""
+        return LSTMState.empty(batch, self.w_d.shape[0])
 
     def unroll(
         self, start: LSTMState, x: Float[Array, "time batch input"], is_first: Bool[Array, "time batch"]

@@ -73,6 +73,11 @@ class Controller(NamedTuple):
     target_value: MLP
     log_alpha: Float[Array, ""]
 
+    @property
+    def trained(self) -> tuple[Actor, tuple[tuple[MLP, MLP], MLP], Float[Array, ""]]:
+        """The parameters of each optimiser, in the order of `Optimisers`."""
+        return self.actor, (self.critics, self.value), self.log_alpha
+
     def q(self, belief: Float[Array, "batch belief"], action: Float[Array, "batch action"]) -> Float[Array, " batch"]:
         """min_i Q_i(s, a)."""
         return jnp.minimum(*(q_value(critic, belief, action) for critic in self.critics))
@@ -210,23 +215,24 @@ class OptimiserState(NamedTuple):
     alpha: optax.OptState
 
 
-def init_optimisers(optimisers: Optimisers, controller: Controller) -> OptimiserState:
-    """Fresh states for `update`."""
-    return OptimiserState(
-        optimisers.actor.init(controller.actor),  # pyright: ignore[reportArgumentType]
-        optimisers.critic.init((controller.critics, controller.value)),  # pyright: ignore[reportArgumentType]
-        optimisers.alpha.init(controller.log_alpha),
-    )
+def init_optimisers(optimisers: Optimisers, trained: tuple[Any, ...]) -> OptimiserState:
+    """Fresh states for the parameters of each optimiser."""
+    return OptimiserState(*(optimiser.init(each) for optimiser, each in zip(optimisers, trained, strict=True)))
+
+
+def step_all(
+    optimisers: Optimisers, state: OptimiserState, trained: tuple[Any, ...], gradient: tuple[Any, ...]
+) -> tuple[tuple[Any, ...], OptimiserState]:
+    """One step of every optimiser; returns the new parameters of each and the new states."""
+    steps = [descend(*each) for each in zip(optimisers, gradient, state, trained, strict=True)]
+    after, states = zip(*steps, strict=True)
+    return after, OptimiserState(*states)
 
 
 def update(
     optimisers: Optimisers, state: OptimiserState, controller: Controller, gradient: Controller, tau: float
 ) -> tuple[Controller, OptimiserState]:
     """One step of every optimiser, then a soft update of V̄."""
-    actor, s_actor = descend(optimisers.actor, gradient.actor, state.actor, controller.actor)
-    (critics, value), s_critic = descend(
-        optimisers.critic, (gradient.critics, gradient.value), state.critic, (controller.critics, controller.value)
-    )
-    log_alpha, s_alpha = descend(optimisers.alpha, gradient.log_alpha, state.alpha, controller.log_alpha)
+    (actor, (critics, value), log_alpha), state = step_all(optimisers, state, controller.trained, gradient.trained)
     target = soft_update(controller.target_value, value, tau)
-    return Controller(actor, critics, value, target, log_alpha), OptimiserState(s_actor, s_critic, s_alpha)
+    return Controller(actor, critics, value, target, log_alpha), state

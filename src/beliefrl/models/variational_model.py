@@ -113,9 +113,8 @@ class VRM(eqx.Module):
         self.deterministic = deterministic
 
     def start(self, batch: int) -> LSTMState:
-        """The state at the start of an episode."""
-        zeros = jnp.zeros((batch, self.joint.w_d.shape[0]))
-        return LSTMState(zeros, zeros)
+        """The state at the start of an episode, leaves (batch, d)."""
+        return LSTMState.empty(batch, self.joint.w_d.shape[0])
 
     def prior(self, before: Float[Array, " d"], prev_action: Float[Array, " action"]) -> Gaussian:
         """p(z_t | d_{t-1}, a_{t-1})."""
@@ -173,7 +172,7 @@ def predict(
         sigma = jnp.zeros_like(sigma) if vrm.deterministic else sigma
         return vrm.next_state(state, jnp.where(observed, x, mean + sigma * noise_x), z), Gaussian(mean, sigma)
 
-    start, x = jax.tree.map(lambda leaf: leaf[0], vrm.start(1)), jnp.where(observed[:, None], x, 0.0)
+    start, x = LSTMState.empty(vrm.joint.w_d.shape[0]), jnp.where(observed[:, None], x, 0.0)
     return jax.lax.scan(step, start, (x, prev_action, observed, noise))[1]
 
 

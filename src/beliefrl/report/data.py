@@ -12,7 +12,7 @@ import numpy as np
 
 from beliefrl import agents
 from beliefrl.analysis.figures import standard_error
-from beliefrl.analysis.groups import Curve, Group, groups, is_finished, last_step, task_of
+from beliefrl.analysis.groups import Curve, Group, groups, is_finished, last_step, task_label
 from beliefrl.analysis.panels import colours, dashes
 from beliefrl.analysis.results import changed
 from beliefrl.analysis.tables import wall_clock
@@ -134,7 +134,7 @@ def _run(run: Run, page_folder: pathlib.Path, groups_of: Sequence[int | None]) -
     return {
         "folder": str(run.folder),
         "agent": config["agent"],
-        "task": task_of(run),
+        "task": task_label(run),
         "group": next((index for index in groups_of if index is not None), None),
         "finished": is_finished(run),
         "seeds": run.seeds,

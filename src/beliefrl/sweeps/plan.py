@@ -67,7 +67,7 @@ class Training:
         folder = sweep / self.name
         if not (folder / "results.json").exists():
             return False
-        options = Options(**_typed(self.options, Options))
+        options = options_of(self)
         try:
             run = Run(folder)
             has_all_steps = ((run.results() or {}).get("step") or 0) >= self.steps
@@ -217,7 +217,7 @@ def options_of(training: Training) -> Options:
 
 def agent_of(name: str, hyperparameters: dict[str, Any]) -> Any:
     """The agent of that name with hyperparameters as JSON has them."""
-    return agents.make(name, **_typed(hyperparameters, agents.find(name)))
+    return agents.make(name, **_typed(hyperparameters, agents.make(name)))
 
 
 def _typed(values: dict[str, Any], like: Any) -> dict[str, Any]:

@@ -152,7 +152,7 @@ def _make_declared(name: str, constants: dict[str, Any]) -> Any:
         raise UserError(f"There is no task {name!r}: {hint}")
     base, value = found
     task = _built(base, _declared_class(base, value), constants)
-    return task if name == base else observe(task, _indices(base, task, MASKS[name[-2:]]))
+    return task if name == base else observed(base, task, MASKS[name[-2:]])
 
 
 def _built(name: str, kind: type, constants: dict[str, Any]) -> Any:

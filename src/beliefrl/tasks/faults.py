@@ -6,7 +6,7 @@ At each step, in this order:
     the task's observation       that of `delay` steps ago, plus Gaussian noise, then zeros for lost entries
 
 The equations are in `Faults`, for JAX and for numpy. `Faulty` applies them to JAX tasks, and
-`gymnasium.FaultyEnvironment` to Gymnasium environments.
+`seen_environment.FaultyEnvironment` to Gymnasium environments.
 """
 
 import dataclasses

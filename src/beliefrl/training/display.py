@@ -17,7 +17,7 @@ from beliefrl.runs.best import evaluations
 from beliefrl.runs.checkpoint import listed
 from beliefrl.runs.records import finite_mean, finite_or_none, sessions
 from beliefrl.runs.run import Run
-from beliefrl.training.evaluation import as_argument
+from beliefrl.training.evaluation import MODES, as_argument
 from beliefrl.training.schedule import Event, Phase
 from beliefrl.training.screen import Screen, duration
 from beliefrl.types import UserError, plain
@@ -129,19 +129,18 @@ class TrainingDisplay:
 def results_table(results: dict[str, Any], seeds: list[int], title: str) -> Table:
     """Returns of every seed with sampled and with mode actions, and their mean and standard error over seeds."""
     table = Table(title=title, title_justify="left")
-    modes = ("sampled", "mode")
     measures = [name.removeprefix("seeds_") for name, of in results["sampled"].items() if name[:6] == "seeds_" and of]
-    headings = [f"{name} {mode}" for name in measures for mode in modes]
+    headings = [f"{name} {mode}" for name in measures for mode in MODES]
     for heading in ("seed", "sampled actions", "mode actions", *headings):
         table.add_column(heading, justify="right")
     for index, seed in enumerate(seeds):
-        returns = [results[mode]["seeds"][index] for mode in modes]
+        returns = [results[mode]["seeds"][index] for mode in MODES]
         cells = ["diverged" if mean is None else f"{mean:.1f}" for mean in returns]
-        cells += [measure_text(name, results[mode][f"seeds_{name}"][index]) for name in measures for mode in modes]
+        cells += [measure_text(name, results[mode][f"seeds_{name}"][index]) for name in measures for mode in MODES]
         table.add_row(str(seed), *cells)
     table.add_section()
-    cells = [_mean(results[mode]) for mode in modes]
-    cells += [measure_text(name, results[mode][name]) for name in measures for mode in modes]
+    cells = [_mean(results[mode]) for mode in MODES]
+    cells += [measure_text(name, results[mode][name]) for name in measures for mode in MODES]
     table.add_row("mean ± S.E.M.", *cells)
     return table
 

@@ -66,9 +66,8 @@ def record(recorder: Recorder, event: Event, lost: Collection[int]) -> dict[str,
         recorder.save(event.states, lost, event.step)
     if event.evaluation is None:
         return None
-    if event.states is not None:
-        returns = np.asarray(event.evaluation.episode_return)[:, MODES.index("sampled")].mean(axis=-1).tolist()
-        best.save(recorder.folder, event.states, event.step, returns)
+    returns = np.asarray(event.evaluation.episode_return)[:, MODES.index("sampled")].mean(axis=-1).tolist()
+    best.save(recorder.folder, event.states, event.step, returns)  # an evaluation comes with the states
     return {"step": event.step} | summary(event.evaluation)
 
 

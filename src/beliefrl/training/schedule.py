@@ -61,12 +61,7 @@ class Phase(enum.StrEnum):
     @property
     def is_compiling(self) -> bool:
         """Whether the phase is only a compilation."""
-        return self in (
-            Phase.COMPILING_AGENT,
-            Phase.COMPILING_EXPLORATION,
-            Phase.COMPILING_PRETRAINING,
-            Phase.COMPILING_LEARNING,
-        )
+        return self.name.startswith("COMPILING")
 
 
 class Event(NamedTuple):
