@@ -293,7 +293,7 @@ class PredictiveSACAgent(ControllerAgent):
         step, b = windows.step, windows.note.policy
         settings = {"decay": self.trace_decay, "off_policy": self.off_policy_trace, "pessimism": self.pessimism}
         y, likeness = double_q.critic_targets(state.controller, s, step, valid, b, key, gamma=self.gamma, **settings)
-        return Samples(belief[:-1], step.prev_action[1:], y, valid), valid_mean(likeness.ravel(), valid.ravel())
+        return Samples(belief[:-1], step.prev_action[1:], y, valid), valid_mean(likeness, valid)
 
     def update(self, state: State, batch: Samples, key: Key[Array, ""]) -> tuple[State, Metrics]:
         given = self.optimisers, state.controller_optimiser, state.controller, batch, key

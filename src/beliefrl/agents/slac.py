@@ -169,7 +169,7 @@ class SLACAgent(SACAgent):
         step = windows.step
         latents = self.infer(model, windows, key)
         terms = elbo_terms(model, latents, step.obs, step.reward, step.prev_action, step.is_first)
-        kl, log_obs, log_reward = (valid_mean(term.ravel(), windows.exists.ravel()) for term in terms)
+        kl, log_obs, log_reward = (valid_mean(term, windows.exists) for term in terms)
         log_likelihood = log_obs + log_reward
         if self.elbo_scaling == "mean":
             kl, log_likelihood = kl / self.z1_size, log_likelihood / (step.obs.shape[-1] + 1)

@@ -65,7 +65,7 @@ class Usual(NamedTuple):
         batches = self.batches + jnp.any(valid)
         rate = jnp.any(valid) / jnp.maximum(batches, 1)
         median = jnp.nan_to_num(jnp.nanmedian(jnp.where(valid, reward, jnp.nan)))
-        deviation = valid_mean(jnp.abs(reward - median).ravel(), valid.ravel())
+        deviation = valid_mean(jnp.abs(reward - median), valid)
         usual = self.reward + rate * (median - self.reward), self.deviation + rate * (deviation - self.deviation)
         return Usual(*usual, batches)
 
@@ -112,4 +112,4 @@ def prediction_loss(
 ) -> Float[Array, ""]:
     """J_model of the transitions that begin at all timesteps but the last; mean over the valid ones."""
     predicted = jax.vmap(jax.vmap(model.predict))(d[:-1], action)
-    return valid_mean(jnp.mean((predicted - target) ** 2, axis=-1).ravel(), valid.ravel())
+    return valid_mean(jnp.mean((predicted - target) ** 2, axis=-1), valid)

@@ -121,8 +121,9 @@ def _last_biases(controller: Controller) -> list[Any]:
     return [network.layers[-1].bias for network in (*controller.critics, controller.value)]
 
 
-def valid_mean(x: Float[Array, " batch"], valid: Bool[Array, " batch"]) -> Float[Array, ""]:
+def valid_mean(x: Float[Array, "*batch"], valid: Bool[Array, "*batch"]) -> Float[Array, ""]:
     """The mean of the valid entries; 0 where none is valid."""
+    x, valid = x.ravel(), valid.ravel()  # a sum over several axes would be rounded differently
     return jnp.sum(jnp.where(valid, x, 0.0)) / jnp.maximum(jnp.sum(valid), 1)
 
 

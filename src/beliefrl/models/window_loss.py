@@ -65,7 +65,7 @@ def model_loss(
     inferred = vrm.infer(start, *inputs, after.step.is_first, draw_noise(key_infer, after, z_size))
 
     def mean(term: Float[Array, "time batch"]) -> Float[Array, ""]:
-        return valid_mean(term.ravel(), after.exists.ravel())
+        return valid_mean(term, after.exists)
 
     if vrm.deterministic:
         error = mean(prediction_error(vrm, inferred, inputs[0]))
