@@ -6,6 +6,7 @@ import re
 import sys
 
 import jax
+import jax.export
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -44,6 +45,20 @@ def play(policy, session, batch, steps=8):
         assert wanted == set(given)
         other, *theirs = session.run(None, given)
         yield action, other
+
+
+def test_an_agent_that_reads_no_reward_is_exported(tmp_path):
+    """A part of its state has no numbers."""
+    pytest.importorskip("onnx")
+    agent = tiny("predictive-sac", perceive_reward=False)
+    policy = Policy(agent, TASK.spec, agent.init(jax.random.key(0), TASK.spec), seed=3)
+    assert 0 <= policy.export(tmp_path / "policy.onnx") < 1e-5
+    session = session_of((tmp_path / "policy.onnx").read_bytes())
+    for batch in (1, 3):
+        for ours, theirs in play(policy, session, batch):
+            np.testing.assert_allclose(theirs, ours, rtol=0, atol=1e-5)
+    policy.export(tmp_path / "policy.jax")
+    assert jax.export.deserialize(bytearray((tmp_path / "policy.jax").read_bytes())).in_avals
 
 
 @pytest.mark.parametrize("name", [pytest.param("vrm", marks=pytest.mark.slow), *AGENTS[1:]])

@@ -229,5 +229,8 @@ def test_actions_are_scaled_to_the_bounds_of_the_environment(tmp_path):
     policy.interface = task.interface
     np.testing.assert_allclose(policy.scale([[-1.0], [0.0], [0.5], [3.0]]), [[-2.0], [2.0], [4.0], [6.0]])
     np.testing.assert_allclose(policy.scale(np.array([-0.5])), [0.0])
+    for wrong in ([0.1, 0.2], 0.1, [np.nan]):
+        with pytest.raises(UserError, match="action"):
+            policy.scale(wrong)
     with pytest.raises(UserError, match=r"a task in JAX has none, its actions are in \[-1, 1\]"):
         beliefrl.load(saved(tmp_path / "other", "sac-mlp", make("pendulum"))).scale([0.0])

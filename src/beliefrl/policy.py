@@ -173,12 +173,17 @@ class Policy:
             low + (action + 1) / 2 · (high - low), of the same shape.
 
         Raises:
-            UserError: the policy has no bounds: it was trained on a task in JAX.
+            UserError: the policy has no bounds, because it was trained on a task in JAX; or the action has the wrong
+                shape, or is not finite.
         """
         if self.interface is None:
             raise UserError("scale needs bounds of actions: a task in JAX has none, its actions are in [-1, 1].")
         low, high = np.array(self.interface.low), np.array(self.interface.high)
-        return low + (np.clip(numbers(action, "action"), -1.0, 1.0) + 1) / 2 * (high - low)
+        given = numbers(action, "action")
+        if given.shape[-1:] != low.shape:
+            raise UserError(f"action has the shape {given.shape}: it must end with {low.size}.")
+        check_finite(given, "action")
+        return np.clip(low + (np.clip(given, -1.0, 1.0) + 1) / 2 * (high - low), low, high)
 
     def _check_unused(self, after: State, other: State) -> None:
         """Raise a UserError if the state after a reward that is NaN differs from that after 0."""

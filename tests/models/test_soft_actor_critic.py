@@ -353,7 +353,7 @@ def test_the_temperature_falls_with_the_entropy_above_its_target(target_entropy,
     """Gradient descent on J_α with a rate of 1: log α rises by the mean of log π(ã|s) + H_target."""
     optimisers, controller, data = Optimisers(*(optax.sgd(rate) for rate in (0.1, 0.1, 1.0))), make(), random_batch()
     settings = {"tau": 0.1, "regulariser": 1e-3, "pessimism": 1.0, "likelihood": 0.0, "target_entropy": target_entropy}
-    given = init_optimisers(optimisers, controller), controller, data, KEY
+    given = init_optimisers(optimisers, controller.trained), controller, data, KEY
     after, _, metrics = jax.jit(lambda: double_q.update(optimisers, *given, **settings))()
     _, log_prob, _ = policy(controller.actor, data.belief, np.asarray(jax.random.normal(KEY, (COUNT, ACTION))))
     mean = np.mean(log_prob[np.asarray(data.valid)])

@@ -225,14 +225,6 @@ def test_means_and_standard_errors_are_over_seeds():
         assert table[mode]["sem"] == pytest.approx(np.std(seeds, ddof=1) / np.sqrt(3))
 
 
-def test_a_summary_has_every_episode():
-    result = episode(TOTAL, SUCCESS)
-    table = summary(result)
-    for index, mode in enumerate(("sampled", "mode")):
-        np.testing.assert_array_equal(table[mode]["returns"], np.asarray(result.episode_return)[:, index])
-        np.testing.assert_array_equal(table[mode]["lengths"], np.asarray(result.length)[:, index])
-
-
 def test_success_is_a_rate():
     table = summary(episode(TOTAL, SUCCESS))
     assert table["sampled"]["seeds_success"] == [0.5, 0.0, 1.0]

@@ -51,7 +51,9 @@ def test_what_no_environment_can_be_made_of_is_one_sentence(tmp_path):
 def test_an_agent_of_velocities_is_not_evaluated_on_positions(tmp_path):
     """Both have two entries, and both names imply which."""
     run = saved(tmp_path / "run", "sac-mlp", make_task("cartpole-v"))
-    with pytest.raises(UserError, match="on velocities of the observation, and the given task shows positions: give"):
+    with pytest.raises(
+        UserError, match="on velocities of the observation, and the given task shows positions: give velocities"
+    ):
         evaluate(run, task=make_task("cartpole-p"))
 
 

@@ -198,7 +198,7 @@ class PredictiveSACAgent(ControllerAgent):
         key_model, key_controller = jax.random.split(key)
         remembered = spec.obs_dim * len(self.observation_memory)
         x = spec.obs_dim + spec.action_dim + self.perceive_reward + remembered
-        sizes = spec.obs_dim, spec.action_dim, x + len(self.perceived.rewards)
+        sizes = spec.obs_dim, spec.action_dim, x + len(self.perceived.reward_memory)
         model = init_model(key_model, *sizes, self.d_size, self.hidden_size, self.long_memories, self.longest_memory)
         belief = self.d_size + x
         settings = self.policy_layers, self.value_layers, self.alpha_start, self.normalise_critics

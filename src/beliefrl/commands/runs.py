@@ -97,6 +97,7 @@ def evaluate(argv: Sequence[str]) -> None:
         print(json.dumps(json.loads(json.dumps(results), parse_constant=lambda _: None)))  # null for a diverged seed
         return
     which = ", best agents" if options.best else ""
+    which += "".join(f", {change}" for change in (*options.constants, *options.faults))
     title = f"{run.config['agent']} on {run.config['task']}, {options.episodes} episodes per seed{which}"
     Console().print(results_table(results, run.seeds, title))
     for seed in run.seeds:
@@ -107,10 +108,12 @@ def evaluate(argv: Sequence[str]) -> None:
 def _changed_task(run: "Run", options: EvaluateOptions) -> Any:
     """The run's task with the constants and faults of the options; None if there are none."""
     from beliefrl import tasks
+    from beliefrl.training.evaluation import task_of
     from beliefrl.types import tuples
 
     if not options.constants and not options.faults:
         return None
+    task_of(run)  # raises the error of a run that has no registered task
     there, constants = run.config, named_values(options.constants, "--constants")
     faults = (there.get("faults") or {}) | named_values(options.faults, "--faults")
     constants = tuples(there["constants"] | constants)

@@ -21,8 +21,8 @@ class Perceived(NamedTuple):
     """What the LSTM reads besides o_t and a_{t-1}."""
 
     reward: bool  # r_{t-1}
-    rewards: tuple[float, ...]  # the time constants of m_t, in steps
-    observations: tuple[float, ...]  # those of n_t
+    reward_memory: tuple[float, ...]  # the time constants of m_t, in steps
+    observation_memory: tuple[float, ...]  # those of n_t
 
 
 class Note(NamedTuple):
@@ -45,8 +45,8 @@ class Memory(NamedTuple):
 
 def no_memory(d: int, obs: int, action: int, perceived: Perceived) -> Memory:
     """The memory before an episode, given the sizes of the LSTM's state, the observation and the action."""
-    observations = jnp.zeros((obs, len(perceived.observations))) if perceived.observations else None
-    note = Note(jnp.zeros(len(perceived.rewards)), Policy(*jnp.zeros((2, action))), observations)
+    observations = jnp.zeros((obs, len(perceived.observation_memory))) if perceived.observation_memory else None
+    note = Note(jnp.zeros(len(perceived.reward_memory)), Policy(*jnp.zeros((2, action))), observations)
     return Memory(LSTMState.empty(d), note)
 
 
@@ -55,10 +55,10 @@ def perceive(
 ) -> tuple[Memory, Float[Array, " x"]]:
     """The memory after one more timestep, and x_t. The policy in its note is still the last one; `act` replaces it."""
     excess = jnp.where(step.is_first, 0.0, scales.usual.excess(step.reward))
-    rewards = remember(before.note.rewards, excess, perceived.rewards)
+    rewards = remember(before.note.rewards, excess, perceived.reward_memory)
     observations = before.note.observations
     if observations is not None:
-        observations = remember(observations, step.obs, perceived.observations)
+        observations = remember(observations, step.obs, perceived.observation_memory)
     x = scales.perception(step, observations, perceived.reward)
     lstm = model.lstm.step(before.lstm, scales.model_input(x, rewards), step.is_first)
     return Memory(lstm, before.note._replace(rewards=rewards, observations=observations)), x

@@ -38,7 +38,7 @@ class Scales(NamedTuple):
     def perception(
         self, step: Timestep, memory: Float[Array, "*batch obs constants"] | None, with_reward: bool = True
     ) -> Float[Array, "*batch x"]:
-        """x_t = (o_t, a_{t-1}, r_{t-1}, n_t), all but the action standardised, given n_t if there is one."""
+        """x_t = (o_t, a_{t-1}, r_{t-1}, n_t), all but the action standardised; the last two only if they are read."""
         obs, reward = self.standardised(step)
         rewards = [reward] if with_reward else []
         remembered = [] if memory is None else [standardise(self.memory, _flat(memory))]

@@ -223,7 +223,7 @@ class _Graph:
         return self.node("Cast", inputs[0], to=self.onnx.helper.np_dtype_to_tensor_dtype(np.dtype(out.dtype)))
 
     def do_reshape(self, inputs, avals, out, parameters):
-        return self.node("Reshape", inputs[0], self.shape(out.shape))
+        return self.node("Reshape", inputs[0], self.shape(out.shape), allowzero=1)
 
     do_squeeze = do_expand_dims = do_reshape
 
@@ -231,7 +231,7 @@ class _Graph:
         shape = [1] * len(out.shape)
         for axis, size in zip(parameters["broadcast_dimensions"], avals[0].shape, strict=True):
             shape[axis] = size
-        reshaped = self.node("Reshape", inputs[0], self.shape(shape))
+        reshaped = self.node("Reshape", inputs[0], self.shape(shape), allowzero=1)
         return reshaped if tuple(shape) == tuple(out.shape) else self.node("Expand", reshaped, self.shape(out.shape))
 
     def do_transpose(self, inputs, avals, out, parameters):

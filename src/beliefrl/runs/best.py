@@ -47,7 +47,7 @@ def save(folder: pathlib.Path, agents: Any, step: int, returns: Sequence[float])
     path = folder / BEST
     try:
         found = evaluations(folder, len(returns))
-        saved = arrays.load(path) if path.exists() else {}
+        saved = arrays.load(path) if path.exists() else {}  # it may be cut off
     except arrays.Damaged:
         path.replace(folder / f"damaged-{BEST}")
         found, saved = evaluations(folder, len(returns)), {}

@@ -279,10 +279,10 @@ def _content(path: pathlib.Path) -> dict[str, Any]:
     """The content of a checkpoint's manifest."""
     try:
         signed = json.loads((path / "manifest.json").read_bytes())
-        content = signed["content"]
-        if signed["sha256"] in (_sha256(_canonical(content)), _sha256(_canonical(_until_0_3(content)))):
+        content, signature = signed["content"], signed["sha256"]
+        if _sha256(_canonical(content)) == signature or _sha256(_canonical(_until_0_3(content))) == signature:
             return content
-    except (FileNotFoundError, ValueError, KeyError, TypeError):
+    except (FileNotFoundError, ValueError, KeyError, TypeError, AttributeError):
         pass
     except OSError as error:
         raise arrays.unreadable(path / "manifest.json", error) from None

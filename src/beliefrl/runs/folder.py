@@ -60,17 +60,19 @@ def clear(folder: pathlib.Path) -> None:
 
 
 def set_aside(folder: pathlib.Path) -> pathlib.Path | None:
-    """Move the logs and agents of a training that begins again to before-1, before-2, ....
+    """Move the logs, agents and results of a training that begins again to before-1, before-2, ....
 
     Returns None, and moves nothing, if no agent was saved.
     """
+    (folder / "metrics").mkdir(exist_ok=True)  # missing after a kill in this function
     if not (folder / "agent.safetensors").exists():
         return None
     number = 1
     while (aside := folder / f"before-{number}").exists():
         number += 1
     aside.mkdir()
-    for name in ("metrics", "best.safetensors", "agent.safetensors"):  # the last one says that there is more to move
+    # After a kill the rest is moved by the next call, because the agent is the last one.
+    for name in ("metrics", "results.json", "curve.png", "best.safetensors", "agent.safetensors"):
         if (folder / name).exists():
             (folder / name).rename(aside / name)
     (folder / "metrics").mkdir()

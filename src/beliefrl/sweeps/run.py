@@ -66,7 +66,7 @@ def sweep(
     Raises:
         UserError: a name, setting or value is impossible (raised before any training starts); another process runs this
             sweep; or a training has failed (raised after all others have ended).
-        Stopped: Ctrl-C or SIGTERM, after every training has written a checkpoint. It is a KeyboardInterrupt.
+        Stopped: Ctrl-C, SIGTERM or SIGHUP, after every training has written a checkpoint. It is a KeyboardInterrupt.
     """
     if not isinstance(experiments, Sequence) or not all(isinstance(each, Experiment) for each in experiments):
         raise UserError("experiments must be a list of beliefrl.Experiment: beliefrl.grid makes one.")
@@ -102,8 +102,8 @@ def sweep(
 
 def confirm() -> None:
     """Answer a signal: it can take minutes until every training has stopped."""
-    stops = "stopping: every training finishes its block of steps and writes a checkpoint; Ctrl-C again ends at once"
-    print(f"beliefrl: {stops}", file=sys.stderr, flush=True)
+    stops = "stopping: every training finishes its block of steps and writes a checkpoint"
+    print(f"beliefrl: {stops}; Ctrl-C again ends only this command", file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager

@@ -32,8 +32,7 @@ MODES = ("sampled", "mode")  # how actions are chosen; the second axis of an eva
 
 
 def summary(result: Episode) -> dict[str, Any]:
-    """For each mode: the mean return of every seed, their mean, its standard error (None with one seed), the measures,
-    and the returns and lengths of all episodes, (seed, episodes).
+    """For each mode: the mean return of every seed, their mean, its standard error (None with one seed), the measures.
 
     Leaves of `result` are (seed, mode, episodes).
     """
@@ -46,8 +45,6 @@ def summary(result: Episode) -> dict[str, Any]:
             "mean": float(finite.mean()),
             "sem": float(finite.std(ddof=1) / np.sqrt(finite.size)) if finite.size > 1 else None,
             "seeds": list(map(finite_or_none, seeds)),
-            "returns": [list(map(finite_or_none, episodes)) for episodes in returns[:, index]],
-            "lengths": np.asarray(result.length)[:, index].tolist(),
             "success": None,
             "seeds_success": None,
         }
@@ -192,9 +189,8 @@ def task_of(run: Run | str | os.PathLike[str], task: Task | GymnasiumTask | type
         asked, there = map(about_task, (tasks.describe(made), run.config))
         shown, before = map(_entries, (asked, there))
         if asked["observe"] != there["observe"] or {shown, before} == set(MASKS.values()):
-            raise UserError(
-                f"{run.folder} was trained on {before} of the observation, and the given task shows {shown}: give them."
-            )
+            given = f"and the given task shows {shown}: give {before}."
+            raise UserError(f"{run.folder} was trained on {before} of the observation, {given}")
         now, before = (each["steps_per_action"] for each in (asked, there))
         if now != before:
             given = f"and the given task has {now}: give the same (beliefrl.with_action_repeat)."
@@ -275,7 +271,11 @@ def evaluate(
         else:
             compiled = jax.jit(jax.vmap(lambda state, key: evaluate_seed(trained, found, state, key, episodes)))
             result = jax.block_until_ready(compiled(states, keys))
-    return {"episodes": episodes} | summary(result)
+    table = summary(result)
+    for index, mode in enumerate(MODES):
+        table[mode]["returns"] = np.asarray(result.episode_return)[:, index].tolist()
+        table[mode]["lengths"] = np.asarray(result.length)[:, index].tolist()
+    return {"episodes": episodes} | table
 
 
 def _showing(progress: bool, episodes: int) -> contextlib.AbstractContextManager[Callable[[int], None]]:

@@ -70,8 +70,10 @@ def program(
         return evaluation.play(states, keys, episodes)
 
     def close() -> None:
-        loop.close()
-        evaluation.close()
+        try:
+            loop.close()
+        finally:
+            evaluation.close()
 
     return Program(
         begin=loop.begin,

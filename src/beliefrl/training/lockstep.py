@@ -148,7 +148,7 @@ class Lockstep:
 
     def _close_processes(self, seconds: float) -> None:
         """Ask all processes to close their environments and end. Kill those that have not ended after `seconds`."""
-        for pipe in self._envs.parent_pipes:
+        for pipe in filter(None, self._envs.parent_pipes):  # None after an error of an environment
             with contextlib.suppress(OSError):  # its process has ended
                 pipe.send(("close", None))
         until = time.monotonic() + seconds
@@ -238,7 +238,8 @@ class _Factory:
             return self.task.environment(self.lane)
         threading.Thread(target=_end_with_parent, daemon=True).start()
         for number in SIGNALS:  # sent to all processes of a job: the training saves, then ends these
-            signal.signal(number, _go_on)  # not SIG_IGN, which a program that the environment starts would inherit
+            if signal.getsignal(number) != signal.SIG_IGN:  # by `nohup`
+                signal.signal(number, _go_on)  # not SIG_IGN, which a program that the environment starts would inherit
         try:
             return self.task.environment(self.lane)
         except UserError as error:

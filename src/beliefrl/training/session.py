@@ -60,6 +60,7 @@ class Session:
         self.is_stopped = False  # by the callback
         self.ended: str | None = None  # why the training is finished before its last step, a sentence
         self.was_finished = False  # before it was resumed
+        self.failed = False  # whether the last checkpoint could not be written
         self.requests = Requests(partial(self._note, "stopping after this block of steps; Ctrl-C again ends at once"))
 
     def run(
@@ -91,14 +92,15 @@ class Session:
             start = initial_arrays if self.given else None
             settings = self.agent, self.task, self.options, restore, self._note, self.own_process, start
             events = stages(*settings, self.recorder.config.get("initial", {}).get("timesteps", 0))
-            try:
-                with self.checkpoints, self.requests, contextlib.closing(events):
+            with self.checkpoints, self.requests, contextlib.closing(events):
+                try:
                     for event in events:
                         if self.was_finished or self._listen(event):
                             break
-            except Stopped:
-                self._finish()
-                raise
+                except Stopped:
+                    with contextlib.suppress(OSError, UserError):  # the checkpoint is there
+                        self._finish()
+                    raise
             self._finish()
         finally:
             self.recorder.note_end()
@@ -198,6 +200,7 @@ class Session:
             seed = self.recorder.seeds[index]
             self.lost.add(int(index))
             self.recorder.log(seed, "diverged", event.step, {"why": why})
+            self._wait()
             kept = self.checkpoints.keep_for(f"seed-{seed}")
             where = f"its last good checkpoint stays in {kept}" if kept else "it had no checkpoint yet"
             note = f"seed {seed} diverged by step {event.step:,}: {why}; {where}."
@@ -229,6 +232,7 @@ class Session:
             return False
         self._look_at_networks(snapshot.seeds.state, event)  # networks are checked before each checkpoint
         progress, asked = snapshot.progress, self.requests.number
+        self._wait()
         if progress.refreshed and not self.last.refreshed:
             self.checkpoints.forget_timesteps()
         if event.phase is not Phase.FAULT:
@@ -246,7 +250,9 @@ class Session:
                 why = cause(error) if isinstance(error, OSError) else error
                 self._note(f"the checkpoint of step {progress.step:,} cannot be written ({why})")
         elif asked:
-            self.checkpoints.wait()
+            self._wait()
+            if self.failed:
+                self._save(snapshot)
             raise Stopped(f"stopped at step {progress.step:,}; {go_on}.", asked)
         elif self.ended or self.is_stopped:
             self._note(self.ended or f"stopped by the callback at step {progress.step:,}; {go_on}")
@@ -259,17 +265,17 @@ class Session:
         lost = sorted(self.lost)
         progress = {"progress": list(snapshot.progress), "metrics": self.recorder.lengths(), "lost": lost}
         progress["results"] = self.results
-        failed = self._wait()
+        self._wait()
+        failed, self.failed = self.failed, False
         self.checkpoints.save(snapshot.progress.step, progress, rest, replay.timesteps, np.asarray(replay.added))
         if failed:
             self.checkpoints.wait()  # a second failure ends the training
         self.last, self.saved_at = snapshot.progress, time.monotonic()
 
-    def _wait(self) -> bool:
-        """Wait until the last checkpoint is written; returns whether that has failed, for example on a full disk."""
+    def _wait(self) -> None:
+        """Wait until the last checkpoint is written. If that has failed, for example on a full disk, remember it."""
         try:
             self.checkpoints.wait()
         except OSError as error:
-            self._note(f"a checkpoint could not be written ({cause(error)}): the next one is written now")
-            return True
-        return False
+            self._note(f"a checkpoint could not be written ({cause(error)}); the training goes on until the next one")
+            self.failed = True

@@ -53,7 +53,8 @@ def train(
         progress: show the progress: live in a terminal, live with the learning curve in a notebook, elsewhere a line
             for each phase and each evaluation, and at least one per minute. False shows nothing.
         resume: continue the training in `out`, if there is one already. It must have been started with the same
-            agent, task and options. `steps` may be larger; stop_at, stop_patience and step_timeout may be different.
+            agent, task and options. `steps` may be larger. These may be different, and are then changed: stop_at,
+            stop_patience, step_timeout, processes, checkpoint_steps, checkpoint_minutes, keep_checkpoints and track.
         options: the fields of `Options`: steps, seeds, seed, envs, overlap, share_env, eval_every,
             eval_episodes, stop_at, stop_patience, init_from, init_best, init_replay, replay_capacity, processes,
             step_timeout, checkpoint_steps, checkpoint_minutes, keep_checkpoints, precision, track. init_from may be a
@@ -66,7 +67,8 @@ def train(
         UserError: an unknown name or option, an impossible value, `out` exists (with `resume`: and was trained with
             other settings), a tracker cannot be opened, the disk is full, or a Gymnasium environment fails. Then
             everything until that step is saved, unless nothing was learned yet.
-        Stopped: Ctrl-C or SIGTERM, after a checkpoint is written; `resume` continues. It is a KeyboardInterrupt.
+        Stopped: Ctrl-C, SIGTERM or SIGHUP, after a checkpoint is written; `resume` continues. It is a
+            KeyboardInterrupt.
     """
     checks.listeners(report=report, callback=callback)
     agent = agents.given(agent)
@@ -131,7 +133,7 @@ def resume(
     Raises:
         UserError: there is no such run, it has no undamaged checkpoint, another process trains it, `steps` is too
             small, or `task` is another one.
-        Stopped: Ctrl-C or SIGTERM, after a checkpoint is written.
+        Stopped: Ctrl-C, SIGTERM or SIGHUP, after a checkpoint is written.
     """
     checks.listeners(report=report, callback=callback)
     limits = {"stop_at": stop_at, "step_timeout": step_timeout}
@@ -158,7 +160,7 @@ def _go_on(
 ) -> Run:
     """Continue a training; `changes` are its new options, `listeners` are `report` and `callback`."""
     folder, made_by = run.folder, agent_of(run, agent)
-    begins_again = not was_ever_written(folder) and not (folder / "results.json").exists()
+    begins_again = not was_ever_written(folder) and not _is_finished(run)
     if not (begins_again or listed(folder)):
         raise UserError(f"{folder} has no usable checkpoint left: train again, with another --out.")
     _ = Options(**_options(run) | changes)  # raise before the folder is locked
@@ -204,6 +206,12 @@ def _run_restored(training: Session, earlier: dict[str, Any]) -> Run:
         if not read:
             with contextlib.suppress(UserError), locked(training.recorder.folder, "is being trained"):
                 _put_back(training.recorder.folder, earlier)
+
+
+def _is_finished(run: Run) -> bool:
+    """Whether the run was evaluated at its last step, or has reached its `stop_at`."""
+    step = (run.results() or {}).get("step") or 0
+    return step >= run.options.steps or run.reached(run.options.stop_at, run.options.stop_patience)
 
 
 def _put_back(folder: pathlib.Path, config: dict[str, Any]) -> None:

@@ -11,7 +11,6 @@ MuJoCo renders through EGL. Any other Gymnasium environment must have a render m
 
 import dataclasses
 import os
-import pathlib
 import sys
 import warnings
 from collections.abc import Callable, Container
@@ -191,10 +190,17 @@ def make_env(of: Run | str | os.PathLike[str] | Task | GymnasiumTask | type) -> 
         UserError: there is no such run or task, or the environment cannot be made, or has other entries than in the
             training.
     """
-    is_run = isinstance(of, Run | os.PathLike) or (isinstance(of, str) and (pathlib.Path(of) / "config.json").exists())
-    task = task_of(cast(Any, of)) if is_run else tasks.given(of)
-    if is_run:
-        check_interface(of if isinstance(of, Run) else Run(cast(Any, of)), task)
+    is_folder = isinstance(of, str) and os.path.exists(os.path.join(of, "config.json"))  # noqa: PTH110, PTH118 - as in `train`
+    if isinstance(of, Run | os.PathLike) or is_folder:
+        run = of if isinstance(of, Run) else Run(cast(Any, of))
+        if not tasks.knows(run.config["task"]):
+            raise UserError(
+                f"{run.folder} was trained on {run.config['task']}, a task of your own: give make_env the task."
+            )
+        task = task_of(run)
+        check_interface(run, task)
+    else:
+        task = tasks.given(of)
     environment = playable(task)
     return TimeLimit(environment, task.spec.max_steps) if isinstance(environment, TaskEnvironment) else environment
 
