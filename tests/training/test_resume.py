@@ -211,7 +211,10 @@ def test_train_goes_on_where_it_is_asked_to(whole, tmp_path):
 def test_a_refused_resume_changes_nothing(whole, tmp_path):
     folder, _ = whole
     for task, phrase in (
-        (make("pendulum-p"), "was trained with task=pendulum-v, not pendulum-p: give that task"),
+        (
+            make("pendulum-p"),
+            "was trained on velocities of the observation, and the given task shows positions: give vel",
+        ),
         (make("pendulum-v", mass=2.0), "was trained with constants="),
         (make("pendulum-v", faults={"noise": 0.1}), "was trained with faults=None, not"),
     ):
