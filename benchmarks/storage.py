@@ -34,7 +34,7 @@ def replay() -> None:
 
     Episodes have 1,000 steps.
     """
-    for name in ("vrm", "sac-mlp", "sac-lstm", "slac"):
+    for name in ("vrm", "predictive-sac", "sac-mlp", "sac-lstm", "slac"):
         agent, task = agents.make(name), Noise(6, 3)
         capacity = schedule.capacity(agent, Options(steps=STEPS))
         seed = phases.begin(agent, task, capacity, jax.random.key(0))
