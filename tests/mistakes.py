@@ -266,7 +266,7 @@ MISTAKES = {
     "resume missing": "no run folder missing",
     "resume there": "there is not a run",
     "resume broken": "broken/config.json cannot be read",
-    "resume resultless": "resultless has no usable checkpoint left: train again, with another --out",
+    "resume resultless": "resultless/results.json is damaged: restore it from a copy, or remove it.",
     "resume untrained --steps many": "--steps must be a whole number, not 'many'",
     "resume untrained --stop-at high": "--stop-at",
     "resume untrained --stop-at nan": "stop_at=nan is impossible",
