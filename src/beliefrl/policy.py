@@ -18,6 +18,7 @@ import jax
 import jax.export
 import jax.numpy as jnp
 import numpy as np
+from gymnasium.spaces import Box
 
 from beliefrl import agents, onnx
 from beliefrl.agents import Agent
@@ -28,6 +29,7 @@ from beliefrl.tasks import Task
 from beliefrl.tasks.environment import TaskEnvironment
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.interface import Interface
+from beliefrl.tasks.spaces import scale
 from beliefrl.training.evaluation import check_interface, restore_policy, task_of
 from beliefrl.types import LARGEST, Spec, Timestep, UserError, check_whole
 
@@ -178,12 +180,12 @@ class Policy:
         """
         if self.interface is None:
             raise UserError("scale needs bounds of actions: a task in JAX has none, its actions are in [-1, 1].")
-        low, high = np.array(self.interface.low), np.array(self.interface.high)
+        space = Box(np.array(self.interface.low), np.array(self.interface.high), dtype=np.float64)
         given = numbers(action, "action")
-        if given.shape[-1:] != low.shape:
-            raise UserError(f"action has the shape {given.shape}: it must end with {low.size}.")
+        if given.shape[-1:] != space.shape:
+            raise UserError(f"action has the shape {given.shape}: it must end with {space.shape[0]}.")
         check_finite(given, "action")
-        return np.clip(low + (np.clip(given, -1.0, 1.0) + 1) / 2 * (high - low), low, high)
+        return np.array([scale(space, each) for each in given.reshape(-1, *space.shape)]).reshape(given.shape)
 
     def _check_unused(self, after: State, other: State) -> None:
         """Raise a UserError if the state after a reward that is NaN differs from that after 0."""

@@ -21,9 +21,9 @@ from beliefrl.runs.options import Options
 from beliefrl.runs.records import provenance
 from beliefrl.runs.run import Recorder, Run
 from beliefrl.training import log
-from beliefrl.training.evaluation import summary
 from beliefrl.training.rollout import Episode
 from beliefrl.training.schedule import Event, Phase
+from beliefrl.training.summary import summary
 from beliefrl.types import UserError
 
 CONFIG = {
@@ -209,7 +209,7 @@ OTHER_TYPES = """
 import json, pathlib, sys
 from beliefrl.training.evaluation import agent_of
 from beliefrl.runs.run import Run
-from beliefrl.training.evaluation import summary
+from beliefrl.training.summary import summary
 from beliefrl.training.rollout import Episode
 from beliefrl.types import UserError
 config = json.loads(pathlib.Path("config.json").read_text())
@@ -387,7 +387,7 @@ def test_the_commit_is_not_that_of_a_project_around_the_package(tmp_path, monkey
 
 
 def test_a_measure_that_no_episode_has_can_be_read_again(recorder):
-    """`evaluation.summary` writes None for it."""
+    """`summary.summary` writes None for it."""
     nan, returns = np.full((2, 2, 3), np.nan), np.ones((2, 2, 3))
     result = summary(Episode(np.ones((2, 2, 3), bool), returns, returns.astype(int), {"time": nan}))
     assert result["mode"]["time"] is None

@@ -8,10 +8,11 @@ import pytest
 from beliefrl import agents, tasks
 from beliefrl.runs.options import Options
 from beliefrl.training import phases, schedule
-from beliefrl.training.evaluation import MODES, evaluate, summary
+from beliefrl.training.evaluation import evaluate
 from beliefrl.training.log import without
 from beliefrl.training.rollout import Episode
 from beliefrl.training.schedule import Event, Phase
+from beliefrl.training.summary import MODES, summary
 from beliefrl.types import UserError
 from worlds import MODELS, SEQUENCES, SHARED, Alternating, Counting, CountingAgent, leaves, trained
 

@@ -3,10 +3,7 @@
 The belief is s_t = [h_t, x_t], with the LSTM's state h_t and x_t = (o_t, a_{t-1}, r_{t-1}, n_t), all standardised by
 running statistics. n_t is a memory of the observations of the episode, which is off by default. The LSTM also reads a
 memory of its unusual rewards. It learns during the whole training, and only by predicting the next observation and
-reward (`models.predictive_model`). The controller (`models.double_q`) learns on the belief. Its gradient does not reach
-the LSTM.
-
-It is not from the paper, and has one model without latent variables where `vrm` has two with them.
+reward (`models.predictive_model`). The gradient of the controller (`models.double_q`) does not reach it.
 
 The model reads the replay in order (`training.replay.Readers`): a reader's window begins with the state at the end of
 its last one. So h_t knows the episode since its beginning, or since the reader's last jump, which empties it. Both
@@ -15,9 +12,8 @@ memories know the whole episode, because the replay stores them.
 The beliefs of the windows of a cycle become transitions. A pool has those of the last `pool` cycles with their targets,
 and the controller's batches are drawn from it: the windows of one cycle are too few and too correlated.
 
-In training the newest weights act. Evaluations and the trained agent use an average of the last weights of the model
-and the actor (`models.average`). The learning rate of the model falls, because averages of the two fit together only if
-the beliefs change slowly.
+In training the newest weights act. Evaluations and the trained agent use averages of the last weights of the model and
+the actor (`models.average`). These fit together only if beliefs change slowly. So the model's learning rate falls.
 """
 
 import dataclasses

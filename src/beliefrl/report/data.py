@@ -18,7 +18,7 @@ from beliefrl.analysis.results import changed
 from beliefrl.analysis.tables import wall_clock
 from beliefrl.runs.records import sessions
 from beliefrl.runs.run import Row, Run
-from beliefrl.training.evaluation import MODES
+from beliefrl.training.summary import MODES
 
 MEDIA = (".mp4", ".webm", ".gif")
 PICTURE = "curve.png"

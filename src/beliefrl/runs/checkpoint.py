@@ -41,9 +41,7 @@ class Found(NamedTuple):
     progress: dict[str, Any]
     tree: Any
     timesteps: Any  # numpy, leaves (*rings, capacity, ...)
-    missing: (
-        np.ndarray
-    )  # (*rings,), how many of the first timesteps ever added are lost: in no file and not in the rings
+    missing: np.ndarray  # (*rings,), how many of the first timesteps are lost: in no file and not in the rings
     passed_over: list[str]  # one sentence for each newer checkpoint, which is damaged
 
 
@@ -71,7 +69,7 @@ class Checkpoints:
             OSError: the previous checkpoint could not be written.
         """
         self.wait()
-        if not all(self._is_there(segment) for segment in self._segments):  # someone has removed files
+        if not segments.are_there(self.folder / "replay", self._segments):  # someone has removed files
             self._segments = []
         state, new = arrays.copied(tree), segments.new(timesteps, added, self._segments)
         self._writing = self._thread.submit(self._write, step, progress, state, new)
@@ -126,10 +124,6 @@ class Checkpoints:
         self._thread.shutdown()
 
     # Writing
-
-    def _is_there(self, segment: Segment) -> bool:
-        path = self.folder / "replay" / segment.file
-        return path.exists() and path.stat().st_size == segment.size
 
     def _write(self, step: int, progress: dict[str, Any], state: dict[str, np.ndarray], new: New) -> None:
         replay = self.folder / "replay"
@@ -291,9 +285,8 @@ def _content(path: pathlib.Path) -> dict[str, Any]:
 
 def _until_0_3(content: dict[str, Any]) -> dict[str, Any]:
     """The content as version 0.3.0 signed it: seeds were numbers, so 9 came before 10."""
-    progress = content["progress"]
-    metrics = {int(seed): length for seed, length in progress.get("metrics", {}).items()}
-    return content | {"progress": progress | {"metrics": metrics}}
+    metrics = {int(seed): length for seed, length in content["progress"].get("metrics", {}).items()}
+    return content | {"progress": content["progress"] | {"metrics": metrics}}
 
 
 def _check(path: pathlib.Path, size: int, sha256: str) -> None:

@@ -174,7 +174,7 @@ def _is_best(value: Any) -> bool:
 
 
 def is_summary(results: Any, seeds: int) -> bool:
-    """Whether `results` is empty, or the summary of an evaluation (`evaluation.summary`) of `seeds` seeds."""
+    """Whether `results` is empty, or the summary of an evaluation (`summary.summary`) of `seeds` seeds."""
     if results == {}:
         return True
     if not isinstance(results, dict) or not _is_step(results.get("step")):

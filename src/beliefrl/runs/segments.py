@@ -99,3 +99,9 @@ def _fill(rings: np.ndarray, saved: np.ndarray, segment: Segment, missing: np.nd
 def _on_host(leaf: Any) -> Any:
     """On a CPU a view of JAX's memory, without a copy. On other devices the array itself, which is indexed there."""
     return np.asarray(leaf) if jax.default_backend() == "cpu" else leaf
+
+
+def are_there(folder: Path, segments: list[Segment]) -> bool:
+    """Whether the files of all segments are in `folder`, each with its size."""
+    paths = [(folder / segment.file, segment.size) for segment in segments]
+    return all(path.exists() and path.stat().st_size == size for path, size in paths)

@@ -1,7 +1,6 @@
 """Gymnasium environments that are stepped together, one per lane, in this process or each in its own process.
 
-The environments do not reset themselves. `restart` begins the next episode after the last observation of an episode
-was returned.
+The environments do not reset themselves: `restart` begins the next episodes.
 """
 
 import atexit
@@ -72,7 +71,7 @@ class Lockstep:
             processes: "always" gives each a process of its own, "never" none, "auto" decides by a measurement.
                 Each process imports the main module of this one: guard it by `if __name__ == "__main__":`.
             notify: called from another thread with a sentence if making, a reset or a step takes longer than SLOW.
-            timeout: maximum seconds of a step; a longer step raises a Fault. A reset has at least RESET.
+            timeout: maximum seconds of a step, and of a reset if it is more than RESET. A longer one raises a Fault.
                 Environments in this process have no limit, because nothing can interrupt them.
 
         Raises:
@@ -154,9 +153,8 @@ class Lockstep:
         until = time.monotonic() + seconds
         for process in self._envs.processes:
             process.join(max(0.0, until - time.monotonic()))
-            if process.is_alive():
-                process.kill()  # they ignore milder signals
-                process.join()
+            process.kill()  # one that has not ended ignores milder signals
+            process.join()
         self._envs.closed = True
 
     @contextlib.contextmanager
@@ -215,11 +213,10 @@ class Lockstep:
 
 def _end_with_parent() -> None:
     """End this process if its parent has ended and the environment, which hangs, has not been closed."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        time.sleep(CLOSING)
-        os._exit(1)
+    parent: Any = multiprocessing.parent_process()
+    parent.join()
+    time.sleep(CLOSING)
+    os._exit(1)
 
 
 def _go_on(number: int, frame: Any) -> None:

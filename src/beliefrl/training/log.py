@@ -10,9 +10,9 @@ from jaxtyping import Array, Bool
 
 from beliefrl.runs import best
 from beliefrl.runs.run import Recorder
-from beliefrl.training.evaluation import MODES, summary
 from beliefrl.training.rollout import Episode
 from beliefrl.training.schedule import Event
+from beliefrl.training.summary import MODES, summary
 
 
 @jax.jit

@@ -277,5 +277,5 @@ class Session:
         try:
             self.checkpoints.wait()
         except OSError as error:
-            self._note(f"a checkpoint could not be written ({cause(error)}); the training goes on until the next one")
+            self._note(f"a checkpoint could not be written ({cause(error)}): if the next one fails, the training ends")
             self.failed = True
