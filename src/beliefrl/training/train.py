@@ -10,7 +10,6 @@ from typing import Any, Literal
 
 from beliefrl import agents, tasks
 from beliefrl.agents import Agent, hyperparameters
-from beliefrl.analysis.groups import is_finished
 from beliefrl.runs.checkpoint import listed, was_ever_written
 from beliefrl.runs.folder import free_folder, locked, write_config
 from beliefrl.runs.records import provenance
@@ -161,10 +160,10 @@ def _go_on(
 ) -> Run:
     """Continue a training; `changes` are its new options, `listeners` are `report` and `callback`."""
     folder, made_by = run.folder, agent_of(run, agent)
-    begins_again = not was_ever_written(folder) and not is_finished(run)
+    begins_again = not was_ever_written(folder) and not _is_finished(run)
     if not (begins_again or listed(folder)):
         raise UserError(f"{folder} has no usable checkpoint left: train again, with another --out.")
-    _ = Options(**_options(run) | changes), run.results()  # raise before the folder is locked
+    _ = Options(**_options(run) | changes)  # raise before the folder is locked
     with contextlib.ExitStack() as showing, contextlib.ExitStack() as stack:
         recorder = stack.enter_context(Recorder(folder, None))
         made = task_of(recorder, task)
@@ -207,6 +206,15 @@ def _run_restored(training: Session, earlier: dict[str, Any]) -> Run:
         if not read:
             with contextlib.suppress(UserError), locked(training.recorder.folder, "is being trained"):
                 _put_back(training.recorder.folder, earlier)
+
+
+def _is_finished(run: Run) -> bool:
+    """Whether the run was evaluated at its last step and saved, or has reached its `stop_at`.
+
+    A log that ends at the last step is not enough: the run may have been killed before it wrote its checkpoint.
+    """
+    step = (run.results() or {}).get("step") or 0
+    return step >= run.options.steps or run.reached(run.options.stop_at, run.options.stop_patience)
 
 
 def _put_back(folder: pathlib.Path, config: dict[str, Any]) -> None:
