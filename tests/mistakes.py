@@ -100,6 +100,7 @@ MISTAKES = {
     "sweep --preset classic --set gamma=0.9 gamma=0.8": "--set has gamma twice: give all its values at once",
     "sweep --agents vrm --agents slac --tasks pendulum": "--agents is given twice",
     "tune vrm pendulum --range gamma=0.9,0.8 gamma=0.7,0.6": "--range has gamma twice",
+    "tune vrm pendulum --set stop_at=-200": "stop_at is impossible in a search",
     "sweep --preset classic --set gama=1": "no hyperparameter 'gama': did you mean gamma?",
     "sweep --preset classic --set seeds=3": "seeds cannot be a setting of a sweep",
     "sweep --preset classic --set gamma=0.9,7": "gamma=7.0 is impossible",

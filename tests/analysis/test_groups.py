@@ -13,11 +13,13 @@ from beliefrl.analysis.aggregate import (
     interquartile_mean,
     interval,
     known_bounds,
+    notes,
     profile,
     scores,
 )
 from beliefrl.analysis.groups import find, groups, is_finished, last_step, left_out
 from beliefrl.analysis.results import cut
+from beliefrl.runs.run import Run
 from beliefrl.types import UserError
 from inputs import a_run, flat
 
@@ -87,7 +89,7 @@ def test_constants_of_a_task_set_it_apart_from_the_same_task_only(tmp_path):
         a_run(tmp_path / "b", [flat(1.0)], constants={"length": 2.0}),
         a_run(tmp_path / "c", [flat(1.0)], task="cartpole", constants={"track": 2.4}),
     ]
-    assert [group.task for group in groups(made)] == ["pendulum-v length=1.0", "pendulum-v length=2.0", "cartpole"]
+    assert [group.task for group in groups(made)] == ["pendulum-v", "pendulum-v length=2.0", "cartpole track=2.4"]
 
 
 def test_action_repeat_is_named_with_the_task_and_its_steps_are_those_of_the_agent(tmp_path):
@@ -251,9 +253,10 @@ def test_a_task_on_which_all_seeds_diverged_at_once_still_counts(tmp_path):
     np.testing.assert_allclose(table["slac"], [[0.0]])
 
 
-def test_bounds_are_of_a_task_its_masked_versions_and_its_faults():
-    for name in ("pendulum", "pendulum-v", "pendulum-p", "pendulum-v noise=0.1"):
+def test_bounds_are_of_a_task_its_masked_versions_and_its_faults_but_not_of_other_constants():
+    for name in ("pendulum", "pendulum-v", "pendulum-p", "pendulum-v noise=0.1", "pendulum steps_per_action=2"):
         assert known_bounds(name) == BOUNDS["pendulum"]
+    assert known_bounds("pendulum max_steps=400") is None
     assert known_bounds("cartpole-swing-up") is None
 
 
@@ -264,8 +267,48 @@ def test_only_tasks_that_all_agents_have_count(tmp_path):
         a_run(tmp_path / "c", [flat(500.0)], agent="slac", task="cartpole"),
     ]
     assert {label: len(tasks) for label, tasks in scores(groups(runs)).items()} == {"vrm": 1, "slac": 1}
-    with pytest.raises(UserError, match="no task that all of these agents have"):
+    with pytest.raises(UserError, match="no task on which all of these agents have an evaluation at the same step"):
         scores(groups([runs[0], runs[2]]))
+
+
+def test_agents_are_compared_at_the_last_step_that_all_of_them_have(tmp_path):
+    runs = [
+        a_run(tmp_path / "a", [flat(-900.0, -150.0, -900.0)], task="pendulum"),
+        a_run(tmp_path / "b", [flat(-900.0, -150.0)], task="pendulum", agent="slac"),
+    ]
+    table = scores(groups(runs))
+    np.testing.assert_allclose([table["vrm"][0], table["slac"][0]], 1.0)
+
+
+def test_what_the_scores_leave_out_is_named(tmp_path):
+    runs = [
+        a_run(tmp_path / "a", [flat(-150.0)], task="pendulum"),
+        a_run(tmp_path / "b", [flat(1000.0)], task="cartpole"),
+        a_run(tmp_path / "c", [flat(500.0), flat(400.0)], agent="slac", task="cartpole"),
+    ]
+    assert notes(groups(runs)) == [
+        "left out: pendulum: not all agents have an evaluation at the same step there",
+        "the numbers of seeds differ: a task with more seeds of an agent counts more for this agent",
+    ]
+    assert notes(groups(runs[:2])) == []
+
+
+def test_a_curve_that_ends_early_names_the_run_that_ends_it(tmp_path):
+    long, short = (
+        a_run(tmp_path / name, [flat(*returns)], first=first)
+        for first, (name, returns) in enumerate({"long": (1.0, 2.0, 3.0), "short": (1.0,)}.items())
+    )
+    (sentence,) = left_out([long, short], groups([long, short]))
+    ends = f"{short.folder}, seed 1, ends at 10, and another seed at 30"
+    assert sentence == f"vrm on pendulum-v ends at step 10, the last that all of its seeds have: {ends}"
+    assert left_out([long], groups([long])) == []
+
+
+def test_runs_that_end_at_a_return_are_a_group_of_their_own(tmp_path):
+    whole, until = a_run(tmp_path / "a", [flat(1.0)]), a_run(tmp_path / "b", [flat(1.0)], first=1)
+    config = until.config | {"options": until.config["options"] | {"stop_at": 0.5}}
+    (until.folder / "config.json").write_text(json.dumps(config))
+    assert [group.label for group in groups([whole, Run(until.folder)])] == ["vrm", "vrm stop_at=0.5"]
 
 
 def test_the_picture_is_made_of_one_seed_too(tmp_path):

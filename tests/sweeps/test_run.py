@@ -141,7 +141,7 @@ def test_a_sweep_that_cannot_be_planned_closes_its_launcher(tmp_path, monkeypatc
     closed = []
     monkeypatch.setattr(runs.sources, "write", full)
     monkeypatch.setattr(Pretence, "stop", lambda self: closed.append(self))
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(UserError, match=r"cannot be written \(No space left on device\): fix that, then the same"):
         sweep(TWO, tmp_path)
     assert len(closed) == 1
 

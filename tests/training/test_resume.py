@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from beliefrl import agents, load, resume, train
+from beliefrl import agents, evaluate, load, resume, train
 from beliefrl.analysis.figures import draw_curve
 from beliefrl.analysis.groups import groups, is_finished
 from beliefrl.cli import main
@@ -545,6 +545,41 @@ def test_a_seed_that_has_never_had_an_agent_is_not_loaded(tmp_path):
     with pytest.raises(UserError, match=r"Seed 5 of .* has diverged before its first evaluation, so it has no agent"):
         load(run, seed=5)
     load(run, seed=4)
+
+
+def test_a_seed_without_an_agent_has_no_returns_whatever_the_task_makes_of_actions_that_are_nan(tmp_path, capsys):
+    """CartPole would count 1,000 steps: no comparison with NaN ends an episode."""
+    run = saved(tmp_path / "run", "sac-mlp", make("cartpole", max_steps=20), seeds=2)
+    arrays = {name: array.copy() for name, array in load_arrays(run.agents()).items()}
+    for array in (each for each in arrays.values() if each.dtype.kind == "f"):
+        array[1] = np.nan
+    run.agents().write_bytes(packed(arrays))
+    with (run.folder / "metrics" / "seed-5.jsonl").open("a") as log:
+        log.write(json.dumps({"step": 10, "kind": "diverged", "why": "a loss is not finite"}) + "\n")
+    found = evaluate(run, episodes=2, progress=False)
+    assert found["diverged"] == [5]
+    for mode in ("sampled", "mode"):
+        assert found[mode]["seeds"] == [found[mode]["mean"], None]
+        assert np.isnan(found[mode]["returns"][1]).all()
+    main(["evaluate", str(run.folder), "--episodes", "1"])
+    assert "seed 5 diverged by step 10: it has no agent" in capsys.readouterr().out
+    for array in (each for each in arrays.values() if each.dtype.kind == "f"):
+        array[:] = np.nan
+    run.agents().write_bytes(packed(arrays))
+    with pytest.raises(UserError, match=r"All seeds of .* diverged before their first evaluation, so it has no agent"):
+        evaluate(run, episodes=1, progress=False)
+
+
+def test_a_run_whose_seeds_have_all_diverged_gets_no_second_try(whole, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(whole[0], folder)
+    before = (folder / "config.json").read_text()
+    for path in (folder / "metrics").glob("*.jsonl"):
+        with path.open("a") as log:
+            log.write(json.dumps({"step": 230, "kind": "diverged", "why": "a loss is not finite"}) + "\n")
+    with pytest.raises(UserError, match=r"All seeds of .* have diverged: train with other settings, and with another"):
+        resume(folder, steps=360)
+    assert (folder / "config.json").read_text() == before
 
 
 def test_a_resume_that_finds_damaged_results_changes_nothing(whole, tmp_path):

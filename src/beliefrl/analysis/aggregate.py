@@ -16,6 +16,7 @@ from jaxtyping import Float
 from beliefrl.analysis.figures import figure, save
 from beliefrl.analysis.groups import Group
 from beliefrl.analysis.panels import add_legend, colours, counts, legend_height, tasks_of, with_curve
+from beliefrl.catalogue import usual_constants
 from beliefrl.types import UserError
 
 Scores = Sequence[Float[np.ndarray, " seed"]]  # one array for each task
@@ -53,25 +54,55 @@ def interval(
 
 
 def scores(groups: Sequence[Group], mode: str = "sampled") -> dict[str, Scores]:
-    """The normalised final returns of each label, for the tasks that all labels have. A diverged seed scores 0.
+    """The normalised returns of each label, for the tasks that all labels have. A diverged seed scores 0.
 
-    For a task without an entry in BOUNDS, a return of 0 scores 0, and the best mean return of these groups scores 1. If
+    They are returns at the last step that all labels have on the task. For a task without an entry in BOUNDS, a return of 0 scores 0, and the best mean return of these groups scores 1. If
     no mean is above 0, the lowest return of a seed scores 0.
 
     Raises:
-        UserError: there is no task that all labels have, or no group has an evaluation of all its seeds.
+        UserError: there is no task on which all labels have an evaluation at the same step, or no group has an
+            evaluation of all its seeds.
     """
-    usable = [group for group in groups if group.diverged.all() or group.curve(mode).steps.size]
-    groups = usable or with_curve(groups, mode)  # raises an error if there is none
+    groups = _usable(groups, mode) or with_curve(groups, mode)  # raises an error if there is none
     labels = list(dict.fromkeys(group.label for group in groups))
-    tasks = [task for task in tasks_of(groups) if {g.label for g in groups if g.task == task} == set(labels)]
-    if not tasks:
-        raise UserError("There is no task that all of these agents have: give runs on the same tasks.")
-    final = {(group.task, group.label): group.final(mode) for group in groups}
-    table: dict[str, Scores] = {}
-    for label in labels:
-        table[label] = [_normalised(final[task, label], bounds(task, final)) for task in tasks]
-    return table
+    steps = common_steps(groups, mode)
+    if not steps:
+        raise UserError(
+            "There is no task on which all of these agents have an evaluation at the same step: give runs on the same "
+            "tasks, with the same --eval-every."
+        )
+    of = {(group.task, group.label): group.final(mode, steps[group.task]) for group in groups if group.task in steps}
+    return {label: [_normalised(of[task, label], bounds(task, of)) for task in steps] for label in labels}
+
+
+def _usable(groups: Sequence[Group], mode: str) -> list[Group]:
+    return [group for group in groups if group.diverged.all() or group.curve(mode).steps.size]
+
+
+def common_steps(groups: Sequence[Group], mode: str = "sampled") -> dict[str, int]:
+    """For each task that all labels have, the last step at which all of them have an evaluation."""
+    labels = {group.label for group in groups}
+    found = {}
+    for task in tasks_of(groups):
+        there = [group for group in groups if group.task == task]
+        steps = [set(group.curve(mode).steps.tolist()) for group in there if not group.diverged.all()]
+        if {group.label for group in there} == labels and (not steps or set.intersection(*steps)):
+            found[task] = max(set.intersection(*steps)) if steps else 0
+    return found
+
+
+def notes(groups: Sequence[Group], mode: str = "sampled") -> list[str]:
+    """A sentence for each task that the scores leave out, and one if tasks do not weigh the same."""
+    usable = _usable(groups, mode)
+    steps = common_steps(usable, mode)
+    said = [
+        f"left out: {task}: not all agents have an evaluation at the same step there"
+        for task in tasks_of(groups)
+        if task not in steps
+    ]
+    if len({len(group.seeds) for group in usable if group.task in steps}) > 1:
+        said.append("the numbers of seeds differ: a task with more seeds of an agent counts more for this agent")
+    return said
 
 
 def bounds(task: str, final: dict[tuple[str, str], np.ndarray]) -> tuple[float, float]:
@@ -83,11 +114,14 @@ def bounds(task: str, final: dict[tuple[str, str], np.ndarray]) -> tuple[float, 
 
 
 def known_bounds(task: str) -> tuple[float, float] | None:
-    """The task's entry in BOUNDS, also for its masked versions, and with faults or other constants; None without one.
+    """The task's entry in BOUNDS, also for its masked versions and with faults; None without one.
 
-    `task` is the task's name in figures. Its first word is the name without faults and constants.
+    `task` is the task's name in figures (`groups.task_label`). With other constants the returns have other bounds.
     """
-    return BOUNDS.get(task.split()[0].removesuffix("-v").removesuffix("-p"))
+    name, *changed = task.split()
+    if usual_constants(name).keys() & {word.partition("=")[0] for word in changed}:
+        return None
+    return BOUNDS.get(name.removesuffix("-v").removesuffix("-p"))
 
 
 def _normalised(returns: np.ndarray, ends: tuple[float, float]) -> np.ndarray:
@@ -107,11 +141,13 @@ def draw_aggregate(groups: Sequence[Group], out: pathlib.Path, mode: str = "samp
     left, right = made.subplots(1, 2, width_ratios=(1, 1.3))
     thresholds = np.linspace(0.0, 1.0, 101)
     for row, (label, values) in enumerate(reversed(table.items())):
+        left.plot([interquartile_mean(values)] * 2, [row - 0.25, row + 0.25], color=colour[label], linewidth=2)
+        right.plot(thresholds, profile(values, thresholds), color=colour[label], linewidth=1.6)
+        if min(map(len, values)) == 1:  # a bootstrap of one seed has no width
+            continue
         low, high = interval(interquartile_mean, values)
         left.barh(row, high - low, left=low, height=0.5, color=colour[label], alpha=0.35)
-        left.plot([interquartile_mean(values)] * 2, [row - 0.25, row + 0.25], color=colour[label], linewidth=2)
         low, high = interval(lambda drawn: profile(drawn, thresholds), values)
-        right.plot(thresholds, profile(values, thresholds), color=colour[label], linewidth=1.6)
         right.fill_between(thresholds, low, high, color=colour[label], alpha=0.15, linewidth=0)
     left.set_yticks(range(len(table)), list(reversed(table)))
     left.set_xlabel("interquartile mean of scores")
@@ -120,7 +156,19 @@ def draw_aggregate(groups: Sequence[Group], out: pathlib.Path, mode: str = "samp
     for axis in (left, right):
         axis.grid(alpha=0.25)
         axis.spines[["top", "right"]].set_visible(False)
-    tasks, seeds = len(next(iter(table.values()))), sorted({len(task) for of in table.values() for task in of})
-    counted = f"{tasks} {'task' if tasks == 1 else 'tasks'}, {counts(seeds)} seeds of each"
-    add_legend(made, colour, f"{counted}; 95 % stratified bootstrap intervals")
+    add_legend(made, colour, _legend(table, groups, mode))
     return save(made, out)
+
+
+def _legend(table: dict[str, Scores], groups: Sequence[Group], mode: str) -> str:
+    """The legend's title: tasks, seeds, actions, diverged seeds and intervals."""
+    tasks, seeds = len(next(iter(table.values()))), {len(task) for of in table.values() for task in of}
+    lost = sum(int(group.diverged.sum()) for group in groups if group.task in common_steps(groups, mode))
+    return "; ".join(
+        [
+            f"{tasks} {'task' if tasks == 1 else 'tasks'}, {counts(seeds)} {'seed' if seeds == {1} else 'seeds'} of each",
+            *(["mode actions"] if mode == "mode" else []),
+            *([f"{lost} diverged, with score 0"] if lost else []),
+            "95 % stratified bootstrap intervals" if max(seeds) > 1 else "no intervals with one seed",
+        ]
+    )

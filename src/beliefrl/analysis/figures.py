@@ -68,10 +68,10 @@ def axis_label(measure: str) -> str:
 
 
 def standard_error(seeds: np.ndarray) -> np.ndarray:
-    """S.E.M. over the first axis, ignoring NaN; 0 if there is only one value."""
+    """S.E.M. over the first axis, ignoring NaN; NaN if there is only one value."""
     count = np.sum(~np.isnan(seeds), axis=0)
     squares = np.nansum((seeds - np.nanmean(seeds, axis=0)) ** 2, axis=0)
-    return np.where(count > 1, np.sqrt(squares / np.maximum(count - 1, 1) / np.maximum(count, 1)), 0.0)
+    return np.where(count > 1, np.sqrt(squares / np.maximum(count - 1, 1) / np.maximum(count, 1)), np.nan)
 
 
 def draw_curve(run: Run | str | os.PathLike[str], path: str | os.PathLike[str] | None = None) -> pathlib.Path:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from beliefrl.analysis import results
+from beliefrl.catalogue import usual_constants
 from beliefrl.runs.given_files import as_path
 from beliefrl.runs.options import Options
 from beliefrl.runs.records import finite_mean, steps_per_action
@@ -79,10 +80,11 @@ class Group:
         steps = sorted(set.intersection(*map(set, healthy or table)))
         return Curve(np.array(steps), np.array([[seed.get(step, np.nan) for step in steps] for seed in table]))
 
-    def final(self, name: str = "sampled") -> np.ndarray:
-        """The last values of a curve, (seed,). NaN: the seed has diverged, or there is no common step."""
+    def final(self, name: str = "sampled", step: int | None = None) -> np.ndarray:
+        """The last values of a curve, or those at a step, (seed,). NaN: the seed has diverged, or there are none."""
         curve = self.curve(name)
-        last = curve.seeds[:, -1] if curve.steps.size else np.full(len(self.seeds), np.nan)
+        at = curve if step is None else curve.only(curve.steps == step)
+        last = at.seeds[:, -1] if at.steps.size else np.full(len(self.seeds), np.nan)
         return np.where(self.diverged, np.nan, last)
 
     @property
@@ -209,7 +211,10 @@ def groups(
 
 
 # Options that can change a return.
-OPTIONS = ("envs", "overlap", "share_env", "init_from", "init_best", "init_replay", "precision", "replay_capacity")
+OPTIONS = (
+    *("envs", "overlap", "share_env", "init_from", "init_best", "init_replay", "precision", "replay_capacity"),
+    *("stop_at", "stop_patience"),
+)
 
 
 def _options(run: Run) -> list[str]:
@@ -219,8 +224,8 @@ def _options(run: Run) -> list[str]:
 
 
 def left_out(runs: Sequence[Run], shown: Sequence[Group]) -> list[str]:
-    """A sentence for each run with seeds that no group counts, because another run has them, and for each group without
-    a curve, because its seeds have no evaluation at the same step.
+    """A sentence for each run with seeds that no group counts, because another run has them, for each group without a
+    curve, and for each group whose curve ends before the last evaluation of its longest seed.
     """
     counted = {(run.folder, seed) for group in shown for run, seed in group.seeds}
     missing = {run.folder: [seed for seed in run.seeds if (run.folder, seed) not in counted] for run in runs}
@@ -229,11 +234,25 @@ def left_out(runs: Sequence[Run], shown: Sequence[Group]) -> list[str]:
         for folder, seeds in missing.items()
         if seeds
     ]
-    return twice + [
-        f"left out: {group.label} on {group.task}: {group.why_no_curve}"
-        for group in shown
-        if group.why_no_curve and not group.diverged.all()
+    without = [
+        f"left out: {group.label} on {group.task}: {group.why_no_curve}" for group in shown if group.why_no_curve
     ]
+    return twice + without + [why for group in shown if (why := shortened_by(group))]
+
+
+def shortened_by(group: Group) -> str | None:
+    """A sentence if the curve of a group ends early, because one of its runs does; None if not."""
+    going = [pair for pair, diverged in zip(group.seeds, group.diverged, strict=True) if not diverged]
+    steps = group.curve().steps
+    if not (going and steps.size):
+        return None
+    (run, seed), longest = min(going, key=lambda pair: last_step(*pair)), max(last_step(*pair) for pair in going)
+    if steps[-1] >= longest:
+        return None
+    return (
+        f"{group.label} on {group.task} ends at step {steps[-1]:,}, the last that all of its seeds have: {run.folder}, "
+        f"seed {seed}, ends at {last_step(run, seed):,}, and another seed at {longest:,}"
+    )
 
 
 def _precedence(run: Run, seed: int) -> tuple[int, str]:
@@ -241,13 +260,14 @@ def _precedence(run: Run, seed: int) -> tuple[int, str]:
 
 
 def task_label(run: Run) -> str:
-    """The name of a task in figures. It includes selected entries, faults and action repeat, if there are any."""
+    """The name of a task in figures, with selected entries, faults, action repeat and changed constants, if any."""
     seen = run.config.get("observe")
     observed = ["observe", *map(str, seen)] if seen else []
     faults = [f"{name}={value}" for name, value in run.config.get("faults", {}).items()]
-    times = steps_per_action(run.config)
-    repeat = [] if times == 1 else [f"steps_per_action={times}"]
-    return " ".join([run.config["task"], *observed, *faults, *repeat])
+    usual = {"steps_per_action": 1} | usual_constants(run.config["task"])
+    given = {name: value for name, value in run.config["constants"].items() if name != "measures"}
+    changed = [f"{name}={value}" for name, value in given.items() if name not in usual or value != usual[name]]
+    return " ".join([run.config["task"], *observed, *faults, *changed])
 
 
 def _differences(settings: Row, others: Sequence[Row]) -> list[str]:

@@ -66,7 +66,7 @@ def draw_curves(groups: Sequence[Group], out: pathlib.Path, mode: str = "sampled
             label, name = group.label, f"{mode}_{measure}" if measure else mode
             draw_line(axis, group.curve(name), colour[label], label, linestyle=style[label])
         finish(axis, task, shown[0].axis, axis_label(measure))
-    add_legend(made, {label: colour[label] for label in labels}, spread(groups), style)
+    add_legend(made, {label: colour[label] for label in labels}, spread(groups, mode), style)
     return save(made, out)
 
 
@@ -166,11 +166,14 @@ def add_legend(made: Any, colour: dict[str, str], title: str, style: dict[str, A
     )
 
 
-def spread(groups: Sequence[Group]) -> str:
-    """The legend's title: the number of seeds in the means."""
+def spread(groups: Sequence[Group], mode: str = "sampled") -> str:
+    """The legend's title: the number of seeds in the means, and what is not usual about them."""
     seeds = {len(group.seeds) for group in groups}
     lost = sum(int(group.diverged.sum()) for group in groups)
     after = f"; {lost} diverged, and {'is' if lost == 1 else 'are'} not in the later means" if lost else ""
+    held = sum(int((group.stopped & ~group.diverged).sum()) for group in groups)
+    after += f"; {held} ended at stop_at, and {'keeps its' if held == 1 else 'keep their'} last return" if held else ""
+    after += "; mode actions" if mode == "mode" else ""
     return ("1 seed each" if seeds == {1} else f"mean and S.E.M. of {counts(seeds)} seeds") + after
 
 
@@ -289,5 +292,5 @@ def draw_elbo(groups: Sequence[Group], out: pathlib.Path, mode: str = "sampled")
         right.set_ylabel(dashed, fontsize=9)
         right.tick_params(labelsize=8)
         right.spines["top"].set_visible(False)
-    add_legend(made, lines, spread([group for group, _ in shown]), {dashed: "--"})
+    add_legend(made, lines, spread([group for group, _ in shown], mode), {dashed: "--"})
     return save(made, out)

@@ -92,7 +92,7 @@ def _draw(kind: str, runs: Sequence[Any], out: pathlib.Path, actions: str) -> tu
     if kind == "elbo":
         return panels.draw_elbo(lines, out, actions), notes
     if kind == "aggregate":
-        return aggregate.draw_aggregate(lines, out, actions), notes
+        return aggregate.draw_aggregate(lines, out, actions), notes + aggregate.notes(lines, actions)
     if kind == "sensitivity":
         lines = panels.pooled(lines, sources.drawn, agents.defaults()["vrm"] | sources.PAPERS)
     return panels.draw_curves(lines, out, actions), notes

@@ -102,7 +102,9 @@ def evaluate(argv: Sequence[str]) -> None:
     Console().print(results_table(results, run.seeds, title))
     for seed in run.seeds:
         for row in run.rows(seed, "diverged"):
-            print(f"seed {seed} diverged by step {row['step']:,}: its agent is from an evaluation before that")
+            known = results["sampled"]["seeds"][run.seeds.index(seed)] is not None
+            whose = "its agent is from an evaluation before that" if known else "it has no agent"
+            print(f"seed {seed} diverged by step {row['step']:,}: {whose}")
 
 
 def _changed_task(run: "Run", options: EvaluateOptions) -> Any:

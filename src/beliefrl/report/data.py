@@ -12,7 +12,7 @@ import numpy as np
 
 from beliefrl import agents
 from beliefrl.analysis.figures import standard_error
-from beliefrl.analysis.groups import Curve, Group, groups, is_finished, last_step, task_label
+from beliefrl.analysis.groups import Curve, Group, groups, is_finished, last_step, shortened_by, task_label
 from beliefrl.analysis.panels import colours, dashes
 from beliefrl.analysis.results import changed
 from beliefrl.analysis.tables import wall_clock
@@ -62,7 +62,8 @@ def page_data(runs: Sequence[Run], page_folder: pathlib.Path, unfinished: bool =
         "groups": [_group(group) for group in lines],
         "without_curve": [
             f"{each.label} on {each.task} has no curve: {why}" for each in grouped if (why := each.why_no_curve)
-        ],
+        ]
+        + [why for each in lines if (why := shortened_by(each))],
         "runs": [
             _run(run, page_folder, [group_of.get((run.folder, seed)) for seed in run.seeds])
             | {"elsewhere": elsewhere.get(run.folder, [])}

@@ -76,7 +76,7 @@ def sweep(
         raise UserError(f"ray={short(ray)} is impossible: give HOST:PORT of the head, or auto.")
     folder = as_path(out)
     plans.plan(experiments)  # raise errors before a folder is made
-    with lock(folder):
+    with writing(folder), lock(folder):
         before = sources.read(folder)
         _check_named(folder, before, experiments)
         slots = [] if ray else ["-"] if workers == 0 else places.slots(workers)
@@ -98,6 +98,19 @@ def sweep(
             f"cause and run the command again; {folder}/logs has the output of each."
         )
     return status
+
+
+@contextlib.contextmanager
+def writing(folder: pathlib.Path) -> Iterator[None]:
+    """Raise a UserError in place of an OSError, such as that of a full disk."""
+    try:
+        yield
+    except BrokenPipeError:  # the reader of the output has closed it
+        raise
+    except OSError as error:
+        raise UserError(
+            f"{folder} cannot be written ({cause(error)}): fix that, then the same command continues."
+        ) from None
 
 
 def confirm() -> None:

@@ -26,10 +26,10 @@ from beliefrl.sweeps import places, ranges, study
 from beliefrl.sweeps.experiments import Experiment
 from beliefrl.sweeps.plan import Training
 from beliefrl.sweeps.progress import SweepStatus
-from beliefrl.sweeps.run import confirm, lock, reason, reporting
+from beliefrl.sweeps.run import confirm, lock, reason, reporting, writing
 from beliefrl.sweeps.study import Actions, Objective, Search, Trial
 from beliefrl.training.stop import Requests, Stopped
-from beliefrl.types import UserError, cause, check_whole, short
+from beliefrl.types import UserError, check_whole, short
 
 LOOK_EVERY = 1.0  # seconds
 PATIENCE = 3  # failures, without any other trial, after which tuning ends
@@ -107,14 +107,8 @@ def tune(
     study.optuna()  # raises an error if it is not installed
     folder = as_path(out or pathlib.Path("runs") / re.sub(r"[^\w.-]+", "-", f"tune-{agent}-{task}"))
     _check_folder(folder)
-    try:
+    with writing(folder):
         return _run(folder, search, trials, prune, workers, progress)
-    except BrokenPipeError:  # the reader of the output has closed it
-        raise
-    except OSError as error:
-        raise UserError(
-            f"{folder} cannot be written ({cause(error)}): fix that, then the same command continues."
-        ) from None
 
 
 def _run(folder: pathlib.Path, search: Search, trials: int, prune: bool, workers: int | None, progress: bool) -> Tuned:

@@ -19,6 +19,7 @@ from beliefrl.tasks import Task
 from beliefrl.tasks.faults import Faults
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.interface import Interface
+from beliefrl.training import log
 from beliefrl.training.checks import about_task
 from beliefrl.training.compilation import keep_compiled
 from beliefrl.training.host_evaluation import Evaluation
@@ -224,18 +225,23 @@ def evaluate(
         own_process: as in `train`. Then each environment of a run with processes="always" has a process of its own.
 
     Returns:
-        {"episodes", "sampled": {"mean", "sem", "seeds", "returns", "lengths", "success", "seeds_success"}, "mode": the
-        same}. Returns are undiscounted; "sem" is over seeds and None with one. "returns" and "lengths" are those of all
+        {"episodes", "diverged", "sampled": {"mean", "sem", "seeds", "returns", "lengths", "success", "seeds_success"},
+        "mode": the same}. Returns are undiscounted; "sem" is over seeds and None with one. "returns" and "lengths" are those of all
         episodes, a list for each seed. "success" is a rate in [0, 1], None if the task does not define success. Other
-        measures of the task have entries of the same kind, such as "distance" and "seeds_distance".
+        measures of the task have entries of the same kind, such as "distance" and "seeds_distance". "diverged" has the
+        seeds that diverged in the training. They play with their last good agent; without one, their returns are NaN.
 
     Raises:
-        UserError: there is no such run, nothing was saved in it, or a number is impossible.
+        UserError: there is no such run, nothing was saved in it, all seeds diverged before their first evaluation, or a
+            number is impossible.
     """
     check_whole("episodes", episodes, 1, MOST_EPISODES)
     check_whole("seed", seed, 0)
     run = run if isinstance(run, Run) else Run(run)
     trained, found, states, precision = restore(run, task, agent, best)
+    lost = np.flatnonzero(~np.asarray(log.finite(states))).tolist()
+    if len(lost) == len(run.seeds):
+        raise UserError(f"All seeds of {run.folder} diverged before their first evaluation, so it has no agent.")
     keep_compiled()
     keys = jax.random.split(jax.random.key(seed), len(run.seeds))
     with _showing(progress, 2 * episodes * len(run.seeds)) as ended, jax.default_matmul_precision(precision):
@@ -245,11 +251,12 @@ def evaluate(
         else:
             compiled = jax.jit(jax.vmap(lambda state, key: evaluate_seed(trained, found, state, key, episodes)))
             result = jax.block_until_ready(compiled(states, keys))
+    result = log.unknown(result, lost)  # whatever a task did with actions that are NaN
     table = summary(result)
     for index, mode in enumerate(MODES):
         table[mode]["returns"] = np.asarray(result.episode_return)[:, index].tolist()
         table[mode]["lengths"] = np.asarray(result.length)[:, index].tolist()
-    return {"episodes": episodes} | table
+    return {"episodes": episodes, "diverged": [seed for seed in run.seeds if run.has_diverged(seed)]} | table
 
 
 def _showing(progress: bool, episodes: int) -> contextlib.AbstractContextManager[Callable[[int], None]]:

@@ -28,20 +28,24 @@ def finite(states: Any) -> Bool[Array, " seed"]:
 
 def without(event: Event, lost: Collection[int]) -> Event:
     """The same event without the `lost` seeds (indices): NaN in their evaluations, and no ends of their episodes."""
-
-    def with_value(leaf: Any, value: Any) -> np.ndarray:
-        leaf = np.array(leaf)
-        leaf[sorted(lost)] = value
-        return leaf
-
     if event.episodes is not None:
-        event = event._replace(episodes=event.episodes._replace(done=with_value(event.episodes.done, False)))
+        event = event._replace(episodes=event.episodes._replace(done=_with(event.episodes.done, lost, False)))
     if event.evaluation is not None:
-        returns, measures = jax.tree.map(
-            lambda leaf: with_value(leaf, np.nan), (event.evaluation.episode_return, event.evaluation.measures)
-        )
-        event = event._replace(evaluation=event.evaluation._replace(episode_return=returns, measures=measures))
+        event = event._replace(evaluation=unknown(event.evaluation, lost))
     return event
+
+
+def unknown(evaluation: Episode, lost: Collection[int]) -> Episode:
+    """The same evaluation with NaN as the returns and measures of the `lost` seeds (indices)."""
+    known = (evaluation.episode_return, evaluation.measures)
+    returns, measures = jax.tree.map(lambda leaf: _with(leaf, lost, np.nan), known)
+    return evaluation._replace(episode_return=returns, measures=measures)
+
+
+def _with(leaf: Any, lost: Collection[int], value: Any) -> np.ndarray:
+    leaf = np.array(leaf)
+    leaf[sorted(lost)] = value
+    return leaf
 
 
 def record(recorder: Recorder, event: Event, lost: Collection[int]) -> dict[str, Any] | None:

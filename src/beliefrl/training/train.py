@@ -160,6 +160,8 @@ def _go_on(
 ) -> Run:
     """Continue a training; `changes` are its new options, `listeners` are `report` and `callback`."""
     folder, made_by = run.folder, agent_of(run, agent)
+    if all(map(run.has_diverged, run.seeds)):  # another try would select the seeds that survive
+        raise UserError(f"All seeds of {folder} have diverged: train with other settings, and with another --out.")
     begins_again = not was_ever_written(folder) and not _is_finished(run)
     if not (begins_again or listed(folder)):
         raise UserError(f"{folder} has no usable checkpoint left: train again, with another --out.")
