@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from gymnasium import spaces
 
-from beliefrl.training import lockstep
+from beliefrl.training import environment_process
 
 BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)
 IMAGE = spaces.Box(0, 255, (64, 64, 3), np.uint8)
@@ -235,6 +235,15 @@ class StuckReset(Fine):
         return super().reset(seed=seed, options=options)
 
 
+class Unmade(Fine):
+    """Ends the second of the processes that make it."""
+
+    def __init__(self):
+        super().__init__()
+        if multiprocessing.current_process().name.endswith("-1"):
+            os._exit(3)
+
+
 class StuckClose(Fine):
     """In a process of its own it takes a minute to close it."""
 
@@ -248,7 +257,7 @@ class Orphan(Stuck):
 
     def __init__(self, folder):
         super().__init__()
-        lockstep.CLOSING = 0.5
+        environment_process.CLOSING = 0.5
         (pathlib.Path(folder) / str(os.getpid())).touch()
 
 

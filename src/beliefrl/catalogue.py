@@ -120,7 +120,7 @@ def written(path: str) -> dict[str, Any]:
 
 @functools.cache
 def usual_constants(task: str) -> dict[str, Any]:
-    """The default constants of one of this library's JAX tasks, with lists for tuples as in JSON; {} for other tasks."""
+    """The default constants of one of our JAX tasks, with lists for tuples as in JSON; {} for other tasks."""
     base = task.removesuffix("-v").removesuffix("-p")
     found = written(TASKS[base]) if base in TASKS else {}
     return {name: list(value) if isinstance(value, tuple) else value for name, value in found.items()}

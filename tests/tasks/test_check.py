@@ -1,7 +1,9 @@
 """What `check` says of a task: names, ranges, what is refused, and what is suspicious."""
 
 import dataclasses
+import re
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -10,7 +12,7 @@ from gymnasium.wrappers import TimeAwareObservation, TimeLimit
 import beliefrl
 from beliefrl import cli, tasks
 from beliefrl.tasks.gymnasium import GymnasiumTask
-from beliefrl.types import UserError
+from beliefrl.types import Spec, UserError
 from worlds import Counting
 from wrong import BOX, UNSUPPORTED, Dictionary, Endless, Fine, spaced, with_observation
 
@@ -252,3 +254,47 @@ def test_a_number_out_of_range_is_one_sentence(wrong):
     (name,) = wrong
     with pytest.raises(UserError, match=f"{name}=.* is impossible: it must be a whole number"):
         beliefrl.check("pendulum", **wrong)
+
+
+@dataclasses.dataclass(frozen=True)
+class Broken:
+    """A task in JAX; `part` says what is wrong with it."""
+
+    part: str = ""
+
+    @property
+    def spec(self):
+        return Spec(3, 1, None if self.part == "max_steps" else 10)
+
+    def reset(self, key):
+        if self.part == "error":
+            raise ValueError("no motor")
+        return jnp.zeros(2), jnp.zeros(4 if self.part == "observation" else 3)
+
+    def step(self, state, action, key):
+        state = state[:1] if self.part == "state" else state
+        reward = action if self.part == "reward" else action[0]
+        terminated = jnp.float32(0) if self.part == "terminated" else jnp.bool_(False)
+        made = state, jnp.zeros(()) if self.part == "scalar" else jnp.zeros(3), reward, terminated
+        return made[:3] if self.part == "three" else made
+
+
+@pytest.mark.parametrize(
+    ("part", "phrase"),
+    [
+        ("max_steps", r"max_steps of .*Broken\.spec=None is impossible: it must be a whole number of at least 1"),
+        ("error", r"reset of .*Broken cannot be traced: ValueError: no motor"),
+        ("observation", r"reset of .*Broken returns an observation of shape \(4,\), but its spec says \(3,\)"),
+        ("scalar", r"step of .*Broken returns an observation of shape \(\), but its spec says \(3,\)"),
+        ("reward", r"step of .*Broken returns a reward of shape \(1,\): return one number"),
+        ("terminated", r"step of .*Broken returns no bool for terminated"),
+        ("state", r"step of .*Broken returns a state with other shapes or types than reset"),
+        ("three", r"step of .*Broken does not return \(state, observation, reward, terminated\)"),
+    ],
+)
+def test_a_task_in_jax_that_does_not_fit_its_spec_is_refused_before_a_folder_is_made(part, phrase, tmp_path):
+    assert re.search(phrase, beliefrl.check(Broken(part)).refusals[0])
+    with pytest.raises(UserError, match=phrase):
+        beliefrl.train("sac-mlp", Broken(part), tmp_path / "run", progress=False)
+    assert not (tmp_path / "run").exists()
+    assert beliefrl.check(Broken()).refusals == ()

@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import pathlib
+from typing import ClassVar
 
 import gymnasium
 import jax
@@ -21,7 +22,7 @@ from beliefrl.tasks.interface import Interface
 from beliefrl.tasks.registered import _Registered
 from beliefrl.training.lockstep import Lockstep
 from beliefrl.types import UserError
-from wrong import BOX, FAULTS, UNSUPPORTED, Dictionary, Fine, observing, spaced
+from wrong import BOX, FAULTS, UNSUPPORTED, Dictionary, Fine, observing, spaced, with_end
 
 
 def a_sentence(error):
@@ -155,6 +156,53 @@ def test_an_environment_that_is_refused_is_closed(actions, task):
 def test_a_text_in_place_of_a_tuple_of_measures_is_an_error(unchecked):
     with pytest.raises(UserError, match=r"measures='success' is a text: give a tuple, \('success',\)"):
         GymnasiumTask(Fine, measures="success")
+
+
+def test_options_are_given_to_a_reset_only_if_there_are_any():
+    """Some environments have no such argument."""
+
+    class Without(Fine):
+        def reset(self, *, seed=None):
+            return super().reset(seed=seed)
+
+    lanes = Lockstep(GymnasiumTask(Without), ["seed 0"])
+    lanes.reset(np.array([0]))
+    lanes.restart(np.array([True]))
+
+
+def test_one_environment_for_two_is_refused_until_it_is_closed():
+    only = Fine()
+    task = GymnasiumTask(lambda: only, "robot")
+    assert task.spec.obs_dim == 2
+    first = task.environment()
+    with pytest.raises(UserError, match="robot is one environment, which is already in use: make a new one in each"):
+        task.environment()
+    with pytest.raises(UserError, match="already in use"):
+        Lockstep(task, ["seed 0", "seed 1"])
+    first.close()
+    task.environment().close()
+
+
+@pytest.mark.parametrize("flag", [np.array(True), jnp.array(True), 1, np.int64(1), np.bool_(True)])
+def test_the_end_of_an_episode_may_be_any_kind_of_flag(flag):
+    environment = GymnasiumTask(with_end(flag, False)).environment()
+    environment.reset(seed=0)
+    ends = [environment.step(np.zeros(1, np.float32))[2] for _ in range(3)]
+    assert ends == [False, False, True]
+
+
+def test_an_attribute_spec_of_its_own_is_no_time_limit():
+    class Own(Fine):
+        spec: ClassVar = {"arm": "left"}
+
+    assert GymnasiumTask(Own).environment().limit is None
+
+
+def test_spaces_of_the_old_package_are_named():
+    Old = type("Box", (), {"__module__": "gym.spaces.box"})
+    for changes in ({"action_space": Old()}, {"observation_space": Old()}):
+        with pytest.raises(UserError, match="has spaces of the old package gym: write `import gymnasium as gym`"):
+            GymnasiumTask(Fine, "robot", changes).environment()
 
 
 def test_options_of_a_reset_are_none_also_at_a_restart():

@@ -4,6 +4,7 @@ import dataclasses
 import math
 from types import SimpleNamespace
 
+import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -279,8 +280,14 @@ def test_a_class_of_environments_is_a_task():
     ("wrong", "phrase"),
     [
         (Fine(), "Fine is given as one environment, but several are needed: give its class"),
-        (Pendulum, r"is no task: give a task \(make_task makes one from its name\), a GymnasiumTask, or a class"),
-        (None, "None is no task"),
+        (
+            gymnasium.make("Pendulum-v1"),
+            r"PendulumEnv is given as one .* its name, 'gym:Pendulum-v1', or a function",
+        ),
+        (gymnasium.make_vec("Pendulum-v1"), r"A vector environment is not needed: give .* one environment, and envs=N"),
+        (Pendulum, r"Pendulum is a class: give a task, Pendulum\(\)"),
+        (None, r"None is no task: give a task \(make_task makes one from its name\), a GymnasiumTask, or a class"),
+        (SimpleNamespace(spec=None), "is no task"),
     ],
 )
 def test_what_is_no_task_is_refused(wrong, phrase):

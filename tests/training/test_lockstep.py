@@ -247,6 +247,27 @@ def test_a_reset_that_takes_too_long_is_a_fault_where_steps_have_a_limit(monkeyp
     assert not any(process.is_alive() for process in lanes._envs.processes)
 
 
+UNMADE = """
+import os, sys
+from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.training.lockstep import Lockstep
+from wrong import Unmade
+
+if __name__ == "__main__":
+    Lockstep(GymnasiumTask(Unmade), ["seed 0", "seed 1", "seed 2"], "always")
+"""
+
+
+def test_a_script_ends_if_the_process_of_one_environment_ends_before_it_is_made(tmp_path):
+    """Python would wait forever for the processes of the others."""
+    script = tmp_path / "script.py"
+    script.write_text(UNMADE)
+    path = {"PYTHONPATH": os.pathsep.join(sys.path)}
+    ended = subprocess.run([sys.executable, script], env=os.environ | path, timeout=100, capture_output=True, text=True)
+    assert ended.returncode == 1
+    assert re.search(r"the process of seed 1 \(exit code 3\) has ended before its environment was made", ended.stderr)
+
+
 def test_environments_that_do_not_close_are_killed(monkeypatch):
     monkeypatch.setattr(lockstep, "CLOSING", 0.5)
     lanes = Lockstep(GymnasiumTask(StuckClose, "robot"), ["seed 0", "seed 1"], "always")

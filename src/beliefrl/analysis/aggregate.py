@@ -56,8 +56,9 @@ def interval(
 def scores(groups: Sequence[Group], mode: str = "sampled") -> dict[str, Scores]:
     """The normalised returns of each label, for the tasks that all labels have. A diverged seed scores 0.
 
-    They are returns at the last step that all labels have on the task. For a task without an entry in BOUNDS, a return of 0 scores 0, and the best mean return of these groups scores 1. If
-    no mean is above 0, the lowest return of a seed scores 0.
+    They are returns at the last step that all labels have on the task. For a task without an entry in BOUNDS, a return
+    of 0 scores 0, and the best mean return of these groups scores 1. If no mean is above 0, the lowest return of a seed
+    scores 0.
 
     Raises:
         UserError: there is no task on which all labels have an evaluation at the same step, or no group has an
@@ -166,7 +167,7 @@ def _legend(table: dict[str, Scores], groups: Sequence[Group], mode: str) -> str
     lost = sum(int(group.diverged.sum()) for group in groups if group.task in common_steps(groups, mode))
     return "; ".join(
         [
-            f"{tasks} {'task' if tasks == 1 else 'tasks'}, {counts(seeds)} {'seed' if seeds == {1} else 'seeds'} of each",
+            f"{tasks} task{'s' * (tasks > 1)}, {counts(seeds)} seed{'s' * (max(seeds) > 1)} of each",
             *(["mode actions"] if mode == "mode" else []),
             *([f"{lost} diverged, with score 0"] if lost else []),
             "95 % stratified bootstrap intervals" if max(seeds) > 1 else "no intervals with one seed",

@@ -68,7 +68,7 @@ class Search:
         self.experiment, self.objective, self.actions = experiment, objective, actions
         self.base = self.training("trial", {})
         if self.base.options.get("stop_at") is not None:
-            raise UserError("stop_at is impossible in a search: a trial that ends early has other evaluations to count.")
+            raise UserError("stop_at is impossible in a search: trials are compared after the same steps.")
         self.agent = agent_of(experiment.agent, self.base.settings)
         self.ranges = ranges.chosen(self.agent, experiment.agent, given, only, list(self.base.settings))
         self.every: int = self.base.options.get("eval_every", Options.eval_every)

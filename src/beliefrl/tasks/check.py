@@ -18,6 +18,7 @@ from beliefrl.tasks.environment import TaskEnvironment
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.settings import settings_kept
 from beliefrl.tasks.spaces import action_names, check_actions, check_names, flat_bounds, flat_size, observation_names
+from beliefrl.tasks.traced import check_traced
 from beliefrl.types import LARGEST, UserError, check_whole, short
 
 MOST_ROWS = 100  # of a printed table
@@ -118,11 +119,15 @@ def _checked(task: Any, observe: Any, steps: int, seed: int, constants: dict[str
 def _declared(task: Any) -> TaskCheck:
     """The declarations of a task, and the refusals. If its spaces are not supported: no entries."""
     if not isinstance(task, GymnasiumTask):
+        name = tasks.describe(task)["task"]
+        refusals = _refusals(lambda: check_traced(task, name))
+        if refusals:
+            return TaskCheck(name, "unknown", "unknown", refusals=refusals)
         spec, names = task.spec, tasks.entry_names(tasks.full(task))
         entries = tuple(Entry(index, name, -np.inf, np.inf) for index, name in enumerate(names))
         actions = tuple(Entry(index, "", -1.0, 1.0) for index in range(spec.action_dim))
         spaces = f"entries: {len(entries)}", f"entries: {spec.action_dim}, from -1 to 1"
-        return TaskCheck(tasks.describe(task)["task"], *spaces, entries, actions, spec.max_steps)
+        return TaskCheck(name, *spaces, entries, actions, spec.max_steps)
     environment = task.bare()
     space, actions = (getattr(environment, f"{what}_space", None) for what in ("observation", "action"))
     found = TaskCheck(task.name, short(space), short(actions))

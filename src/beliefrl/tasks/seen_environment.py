@@ -1,6 +1,7 @@
 """A Gymnasium environment as the agent sees it, with checks of everything that it returns."""
 
 import contextlib
+import weakref
 from collections.abc import Callable
 from typing import Any
 
@@ -14,8 +15,9 @@ from beliefrl.tasks.faults import STREAM, Draws
 from beliefrl.tasks.interface import measure_of
 from beliefrl.tasks.repeat import actions
 from beliefrl.tasks.spaces import check_actions, fits, flat_bounds, flat_size, limits, scale
-from beliefrl.types import as_array, check_indices, said, short
+from beliefrl.types import UserError, as_array, check_indices, said, short
 
+_in_use: weakref.WeakValueDictionary[int, Any] = weakref.WeakValueDictionary()  # innermost environments by their id
 ENDLESS = 10_000  # steps after which an episode without a time limit is considered endless
 
 
@@ -31,6 +33,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         self.steps, self.length = 0, 0  # actions in total, and steps of the environment in this episode
         self._measured: dict[str, float] = {}  # in this episode
         self.inner = task.bare()
+        self._check_new()
         self.inner_action_space: Any = getattr(self.inner, "action_space", None)
         self.inner_observation_space: Any = getattr(self.inner, "observation_space", None)
         try:
@@ -38,6 +41,17 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         except BaseException:
             self.close()
             raise
+
+    def _check_new(self) -> None:
+        """Raise a UserError if `make` has returned an environment that is in use: two would step the same one."""
+        bare = getattr(self.inner, "unwrapped", self.inner)
+        if _in_use.get(id(bare), self) is bare:
+            raise UserError(
+                f"{self.task.name} is one environment, which is already in use: make a new one in each call, such as "
+                "GymnasiumTask(lambda: MyEnvironment()). If there can be only one, such as a robot, use share_env."
+            )
+        with contextlib.suppress(TypeError):  # its class may not allow weak references
+            _in_use[id(bare)] = bare
 
     def _prepare(self, task: Any) -> None:
         """Check the spaces; set which entries are observed, and the time limit."""
@@ -58,7 +72,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode."""
         self.length, self._measured = 0, {}
-        result = self._call("reset", lambda: self.inner.reset(seed=seed, options=options or None))
+        result = self._call("reset", lambda: self.inner.reset(seed=seed, **({"options": options} if options else {})))
         if not (isinstance(result, tuple) and len(result) == 2):
             raise self._fault("reset did not return (observation, info)")
         return self._seen(result[0]), {}
@@ -108,6 +122,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         """Close the environment, ignoring errors."""
         with contextlib.suppress(Exception):
             self.inner.close()
+        _in_use.pop(id(getattr(self.inner, "unwrapped", self.inner)), None)
 
     def _fault(self, what: str) -> Fault:
         seed = f"{self.seed}, " if self.seed else ""
@@ -168,15 +183,17 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         return float(value)
 
     def _flag(self, value: Any, name: str) -> bool:
-        if not isinstance(value, bool | np.bool_ | int | np.integer) or value not in (0, 1):
+        if isinstance(value, np.ndarray | np.generic) or hasattr(value, "__array__"):
+            value = np.asarray(value).item() if np.ndim(value) == 0 else value
+        if not isinstance(value, bool | int) or value not in (0, 1):
             raise self._fault(f"{name} is {short(value)}, but must be True or False")
         return bool(value)
 
 
 def _time_limit(environment: Any) -> int | None:
     """The time limit that an environment was registered with, or that a wrapper gives it."""
-    registered = getattr(environment, "spec", None)
-    if registered:
+    registered = getattr(environment, "spec", None)  # an environment may have anything under this name
+    if registered and hasattr(registered, "max_episode_steps"):
         return registered.max_episode_steps
     while isinstance(environment, gymnasium.Wrapper):
         if isinstance(environment, TimeLimit):

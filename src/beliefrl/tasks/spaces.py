@@ -33,6 +33,7 @@ FAR = 100  # an observation may leave its declared range by this many times the 
 
 def check_actions(space: Any, name: str) -> None:
     """Raise a UserError if the action space of the environment `name` is not supported."""
+    _check_package(space, name)
     if not isinstance(space, spaces.Box):
         raise UserError(
             f"{name} has the actions {short(space)}: only a bounded Box of real numbers is supported "
@@ -56,18 +57,25 @@ def check_actions(space: Any, name: str) -> None:
         )
 
 
+def _check_package(space: Any, name: str) -> None:
+    """Raise a UserError for a space of the old package gym."""
+    if type(space).__module__.partition(".")[0] == "gym":
+        raise UserError(f"{name} has spaces of the old package gym: write `import gymnasium as gym` in its module.")
+
+
 def flat_size(space: Any, name: str) -> int:
     """The number of entries in a flat observation of a space.
 
     Raises:
         UserError: the space contains images, text, or anything else that does not flatten to a fixed number of entries.
     """
+    _check_package(space, name)
     for path, leaf in leaves(space):
         where = f" at {''.join(f'[{key!r}]' for key in path)}" if path else ""
         if isinstance(leaf, spaces.Box) and _is_image(leaf):
             raise UserError(
                 f"{name} observes images ({short(leaf)}{where}): only vectors of numbers are supported, such as a "
-                "robot's sensors."
+                "robot's sensors. If they are small matrices, flatten them (gymnasium's FlattenObservation)."
             )
         if not isinstance(leaf, spaces.Box | spaces.Discrete | spaces.MultiBinary | spaces.MultiDiscrete):
             raise UserError(

@@ -22,16 +22,30 @@ def as_task(task: Any) -> Any:
     if isinstance(task, type) and issubclass(task, gymnasium.Env):
         return GymnasiumTask(task)
     if isinstance(task, gymnasium.Env):
-        kind = type(task).__name__
-        raise UserError(f"{kind} is given as one environment, but several are needed: give its class.")
+        raise UserError(_not_one(task))
+    if isinstance(task, gymnasium.vector.VectorEnv):
+        raise UserError("A vector environment is not needed: give the class or name of one environment, and envs=N.")
     if isinstance(task, GymnasiumTask):  # its spec would make an environment
         return task
-    if isinstance(task, type) or not hasattr(task, "spec"):
+    lacks = [name for name in ("spec", "reset", "step") if not hasattr(task, name)]
+    if isinstance(task, type) and not lacks:
+        raise UserError(f"{task.__name__} is a class: give a task, {task.__name__}().")
+    if isinstance(task, type) or lacks:
         raise UserError(
             f"{short(task)} is no task: give a task (make_task makes one from its name), a GymnasiumTask, or a class "
             "of Gymnasium environments."
         )
     return task
+
+
+def _not_one(environment: Any) -> str:
+    """Why a Gymnasium environment is no task, and what is."""
+    kind, name = type(environment.unwrapped).__name__, getattr(getattr(environment, "spec", None), "id", None)
+    give = f"its class, {kind}" if name is None else f"its name, 'gym:{name}'"
+    return (
+        f"{kind} is given as one environment, but several are needed: give {give}, or a function that makes a new one, "
+        f"GymnasiumTask(lambda: {kind}(...))."
+    )
 
 
 def observe(task: Any, indices: tuple[int, ...]) -> Any:

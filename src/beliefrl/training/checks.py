@@ -8,6 +8,7 @@ from beliefrl.runs import trackers
 from beliefrl.runs.records import steps_per_action
 from beliefrl.runs.run import Run
 from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.tasks.traced import check_traced
 from beliefrl.training.schedule import Options
 from beliefrl.types import UserError, plain, short
 
@@ -29,8 +30,13 @@ def listeners(**functions: Any) -> None:
 
 
 def possible(options: Options, task: Any, own_process: bool) -> None:
-    """Raise a UserError if options need a package, a kind of task or processes that are not available."""
+    """Raise a UserError if a task in JAX does not work, or if options need what is not available.
+
+    That can be a package, a kind of task, or processes.
+    """
     trackers.check(options.track)
+    if not isinstance(task, GymnasiumTask):
+        check_traced(task, tasks.describe(task)["task"])
     if options.overlap and not isinstance(task, GymnasiumTask):
         raise UserError(
             "overlap needs a Gymnasium environment: a task in JAX is compiled together with the updates. Leave the "

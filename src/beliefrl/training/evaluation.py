@@ -226,10 +226,11 @@ def evaluate(
 
     Returns:
         {"episodes", "diverged", "sampled": {"mean", "sem", "seeds", "returns", "lengths", "success", "seeds_success"},
-        "mode": the same}. Returns are undiscounted; "sem" is over seeds and None with one. "returns" and "lengths" are those of all
-        episodes, a list for each seed. "success" is a rate in [0, 1], None if the task does not define success. Other
-        measures of the task have entries of the same kind, such as "distance" and "seeds_distance". "diverged" has the
-        seeds that diverged in the training. They play with their last good agent; without one, their returns are NaN.
+        "mode": the same}. Returns are undiscounted; "sem" is over seeds and None with one. "returns" and "lengths" are
+        those of all episodes, a list for each seed. "success" is a rate in [0, 1], None if the task does not define
+        success. Other measures of the task have entries of the same kind, such as "distance" and "seeds_distance".
+        "diverged" has the seeds that diverged in the training. They play with their last good agent; without one, their
+        returns are NaN.
 
     Raises:
         UserError: there is no such run, nothing was saved in it, all seeds diverged before their first evaluation, or a

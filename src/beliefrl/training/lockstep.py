@@ -7,17 +7,15 @@ import atexit
 import contextlib
 import multiprocessing
 import os
-import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
-import gymnasium
 import jax
 import numpy as np
-from gymnasium import logger, spaces
+from gymnasium import logger
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from jaxtyping import Array, Bool, Float, Int, Key
 
@@ -25,13 +23,12 @@ from beliefrl.errors import Fault
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.seen_environment import Environment
 from beliefrl.tasks.settings import settings_kept
-from beliefrl.training.stop import SIGNALS
+from beliefrl.training.environment_process import CLOSING, Factory
 from beliefrl.types import UserError
 
 HANDOVER = 5e-4  # approximate seconds for passing a step to other processes
 SLOW = 60.0  # seconds after which a call that has not returned is reported
 RESET = 60.0  # seconds that a reset may take, if steps have a limit
-CLOSING = 60.0  # seconds that processes have to close their environments
 
 
 class StepResults(NamedTuple):
@@ -81,6 +78,7 @@ class Lockstep:
         self.steps = 0
         self._is_wide = jax.config.read("jax_enable_x64")
         self._envs: Any = None
+        self._are_made = False
         self._call: _Call | None = None  # the call of the environments that has not returned
         self._closed = threading.Event()
         if notify is not None:
@@ -90,23 +88,26 @@ class Lockstep:
             with self._calling("gymnasium.make"):
                 self.apart = processes == "always" or (processes == "auto" and _pays(task, len(lanes)))
                 if self.apart:
-                    self._envs = self._processes([_Factory(task, lane) for lane in lanes])
+                    self._start_processes([Factory(task, lane) for lane in lanes])
                 else:
-                    factories = [partial(_kept, made, _Factory(task, lane)) for lane in lanes]
+                    factories = [partial(_kept, made, Factory(task, lane)) for lane in lanes]
                     self._envs = SyncVectorEnv(factories, autoreset_mode=AutoresetMode.DISABLED)
+            self._are_made = True
         except BaseException:
             self._closed.set()  # nothing is under way that could be slow
             for environment in made:
                 environment.close()
+            if self._envs is not None:
+                self._end_processes(0.0)
             raise
 
-    def _processes(self, factories: list["_Factory"]) -> AsyncVectorEnv:
+    def _start_processes(self, factories: list[Factory]) -> None:
         # Forking a process in which JAX runs threads may never return. A daemon could not start processes of its own.
         settings: dict[str, Any] = {"context": "spawn", "daemon": False, "autoreset_mode": AutoresetMode.DISABLED}
+        self._envs = AsyncVectorEnv.__new__(AsyncVectorEnv)  # so that its processes can be ended if one cannot start
         with settings_kept():  # an environment is made here too, to see its spaces
-            envs = AsyncVectorEnv(factories, **settings)
+            AsyncVectorEnv.__init__(self._envs, factories, **settings)
         atexit.register(self.close)  # at its exit Python would wait for processes that ignore SIGTERM
-        return envs
 
     def reset(self, seeds: Int[np.ndarray, " lane"]) -> Any:
         """Begin an episode in every environment; returns the observations, (lane, obs)."""
@@ -141,17 +142,19 @@ class Lockstep:
         self._closed.set()
         atexit.unregister(self.close)
         if self.apart and not self._envs.closed:
-            self._close_processes(0.0 if self._call is not None else CLOSING)  # a call may never return
+            self._end_processes(0.0 if self._call is not None else CLOSING)  # a call may never return
         with contextlib.suppress(Exception):
             self._envs.close()
 
-    def _close_processes(self, seconds: float) -> None:
+    def _end_processes(self, seconds: float) -> None:
         """Ask all processes to close their environments and end. Kill those that have not ended after `seconds`."""
-        for pipe in filter(None, self._envs.parent_pipes):  # None after an error of an environment
+        for pipe in filter(None, getattr(self._envs, "parent_pipes", ())):  # None after an error of an environment
             with contextlib.suppress(OSError):  # its process has ended
                 pipe.send(("close", None))
         until = time.monotonic() + seconds
-        for process in self._envs.processes:
+        for process in getattr(self._envs, "processes", ()):  # some may not have been started
+            if process.pid is None:
+                continue
             process.join(max(0.0, until - time.monotonic()))
             process.kill()  # one that has not ended ignores milder signals
             process.join()
@@ -201,61 +204,20 @@ class Lockstep:
     def _death(self) -> str:
         dead = []
         processes = getattr(self._envs, "processes", ())
-        for lane, process in zip(self.lanes, processes, strict=bool(processes)):
-            process.join(timeout=0.5)
-            if not process.is_alive():
+        for lane, process in zip(self.lanes, processes, strict=False):  # some may not have been started
+            if process.pid is not None:
+                process.join(timeout=0.5)
+            if process.exitcode is not None:
                 dead.append(f"{lane} (exit code {process.exitcode})")
         who = " and ".join(dead) or "one of them"
         killed = any(process.exitcode is not None and process.exitcode < 0 for process in processes)
         why = ", killed or out of memory" if killed or not dead else ""
+        if not self._are_made:
+            why += ' before its environment was made (see above; a script needs `if __name__ == "__main__":`)'
         return f"{self.task.name} (step {self.steps}): the process of {who} has ended{why}."
 
 
-def _end_with_parent() -> None:
-    """End this process if its parent has ended and the environment, which hangs, has not been closed."""
-    parent: Any = multiprocessing.parent_process()
-    parent.join()
-    time.sleep(CLOSING)
-    os._exit(1)
-
-
-def _go_on(number: int, frame: Any) -> None:
-    """A handler that does nothing."""
-
-
-class _Factory:
-    """Makes one lane's environment, in this process or a worker."""
-
-    def __init__(self, task: GymnasiumTask, lane: str):
-        self.task, self.lane, self.process = task, lane, os.getpid()
-        self.sizes = task.spec.obs_dim, task.spec.action_dim
-
-    def __call__(self) -> Any:
-        if os.getpid() == self.process:
-            return self.task.environment(self.lane)
-        threading.Thread(target=_end_with_parent, daemon=True).start()
-        for number in SIGNALS:  # sent to all processes of a job: the training saves, then ends these
-            if signal.getsignal(number) != signal.SIG_IGN:  # by `nohup`
-                signal.signal(number, _go_on)  # not SIG_IGN, which a program that the environment starts would inherit
-        try:
-            return self.task.environment(self.lane)
-        except UserError as error:
-            return _NotMade(f"{self.lane}: {error}", *self.sizes)
-
-
-class _NotMade(gymnasium.Env[Any, Any]):
-    """In place of an environment that cannot be made in its process: `reset` says why."""
-
-    def __init__(self, why: str, obs: int, action: int):
-        self.why = why
-        self.observation_space = spaces.Box(-np.inf, np.inf, (obs,), np.float32)
-        self.action_space = spaces.Box(-1.0, 1.0, (action,), np.float32)
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        raise Fault(self.why)
-
-
-def _kept(made: list[Environment], factory: _Factory) -> Environment:
+def _kept(made: list[Environment], factory: Factory) -> Environment:
     made.append(factory())
     return made[-1]
 
