@@ -4,6 +4,7 @@ A damaged file must cause a UserError and no traceback. So the keys and types th
 ranges of options are checked by `Options`, and those of hyperparameters by the agents.
 """
 
+import contextlib
 import json
 import os
 import pathlib
@@ -22,6 +23,7 @@ import numpy as np
 from beliefrl.types import LARGEST, UserError, cause
 
 PACKAGES = ("beliefrl", "jax", "jaxlib", "equinox", "optax", "numpy")
+SIMULATORS = ("gymnasium", "mujoco", "pybullet")  # recorded where they are used; returns depend on their versions
 Row = dict[str, Any]
 
 
@@ -209,8 +211,12 @@ def _are_known(values: Any) -> bool:
 
 def provenance() -> dict[str, Any]:
     """The record of this process in a run's config."""
+    versions = {"python": platform.python_version()} | {name: metadata.version(name) for name in PACKAGES}
+    for name in (name for name in SIMULATORS if name in sys.modules):
+        with contextlib.suppress(metadata.PackageNotFoundError):  # another module may have this name
+            versions[name] = metadata.version(name)
     return {
-        "versions": {"python": platform.python_version()} | {name: metadata.version(name) for name in PACKAGES},
+        "versions": versions,
         "device": str(jax.devices()[0].device_kind),
         "git_commit": _git_commit(),
         "command": [os.path.basename(sys.argv[0]), *sys.argv[1:]],
