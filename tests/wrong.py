@@ -152,6 +152,7 @@ UNSUPPORTED = {  # environment: a phrase of the message
 }
 
 PAIR = spaces.MultiDiscrete([2, 3])
+BOXES = spaces.Dict({"arm": BOX, "imu": BOX})
 FAULTS = {  # environment: (a phrase of the message, the step that it names)
     observing(PAIR, np.array([1, 2]), np.array([2, 0])): ("does not fit its space MultiDiscrete", 3),
     observing(spaces.Discrete(3), 1, -1): ("does not fit its space Discrete", 3),
@@ -180,6 +181,15 @@ FAULTS = {  # environment: (a phrase of the message, the step that it names)
     with_observation([[1.0], [2.0, 3.0]]): ("the observation has type object", 3),
     with_observation(None): ("the observation has type object", 3),
     Dictionary: ("the observation does not fit its space Dict", 3),
+    observing(BOXES, {"arm": np.ones(2), "imu": np.ones(2)}, {"arm": np.ones(2), "imu": np.ones(3)}): (
+        " at ['imu']",
+        3,
+    ),
+    observing(BOXES, {"arm": np.ones(2), "imu": np.ones(2)}, {"arm": np.ones(2)}): (" at ['imu']", 3),
+    observing(BOXES, {"arm": np.ones(2), "imu": np.ones(2)}, {"arm": np.ones(2), "imu": np.array([0, np.nan])}): (
+        "entry 3 of the observation (imu 1) is nan",
+        3,
+    ),
     with_reward(float("nan")): ("the reward is nan", 3),
     with_reward(float("inf")): ("the reward is inf", 3),
     with_reward(-1e200): ("the reward is -1e+200", 3),

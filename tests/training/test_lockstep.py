@@ -268,6 +268,16 @@ def test_a_script_ends_if_the_process_of_one_environment_ends_before_it_is_made(
     assert re.search(r"the process of seed 1 \(exit code 3\) has ended before its environment was made", ended.stderr)
 
 
+def test_what_cannot_be_sent_to_a_process_is_named():
+    held = threading.Lock()
+
+    def make():
+        return Fine() if held else None
+
+    with pytest.raises(UserError, match=r"robot cannot be sent to a process of its own \(TypeError: cannot pickle"):
+        Lockstep(GymnasiumTask(make, "robot"), ["seed 0"], "always")
+
+
 def test_environments_that_do_not_close_are_killed(monkeypatch):
     monkeypatch.setattr(lockstep, "CLOSING", 0.5)
     lanes = Lockstep(GymnasiumTask(StuckClose, "robot"), ["seed 0", "seed 1"], "always")

@@ -14,7 +14,7 @@ from beliefrl.errors import Fault
 from beliefrl.tasks.faults import STREAM, Draws
 from beliefrl.tasks.interface import measure_of
 from beliefrl.tasks.repeat import actions
-from beliefrl.tasks.spaces import check_actions, fits, flat_bounds, flat_size, limits, scale
+from beliefrl.tasks.spaces import check_actions, flat_bounds, flat_size, limits, misfit, observation_names, scale
 from beliefrl.types import UserError, as_array, check_indices, said, short
 
 _in_use: weakref.WeakValueDictionary[int, Any] = weakref.WeakValueDictionary()  # innermost environments by their id
@@ -150,27 +150,37 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
             if value.shape != space.shape:
                 raise self._fault(f"the observation has shape {value.shape}, but its space says {space.shape}")
         else:
-            try:
-                value = np.asarray(spaces.flatten(space, obs)) if fits(space, obs) else np.empty(0)
-            except Exception:
-                raise self._fault(f"the observation does not fit its space {short(space)}") from None
-            if value.shape != (self._size,):
-                raise self._fault(f"the observation does not fit its space {short(space)}")
+            value = self._flattened(space, obs)
         self.whole = value.reshape(-1)
         with np.errstate(over="ignore"):
             flat = self.whole[self.indices].astype(np.float32)
         if not np.isfinite(flat).all():
             entry = int(self.indices[~np.isfinite(flat)][0])
-            raise self._fault(f"entry {entry} of the observation is {value.reshape(-1)[entry]}")
+            raise self._fault(f"entry {entry} of the observation{self._named(entry)} is {value.reshape(-1)[entry]}")
         far = (flat < self._lowest) | (flat > self._highest)
         if far.any():
             entry = int(self.indices[far][0])
             bounds = flat_bounds(space)
             raise self._fault(
-                f"entry {entry} of the observation is {value.reshape(-1)[entry]}, far outside its space, which says "
-                f"{bounds.low[entry]} to {bounds.high[entry]}: correct the observation or its space"
+                f"entry {entry} of the observation{self._named(entry)} is {value.reshape(-1)[entry]}, far outside its "
+                f"space, which says {bounds.low[entry]} to {bounds.high[entry]}: correct the observation or its space"
             )
         return flat
+
+    def _flattened(self, space: Any, obs: Any) -> np.ndarray:
+        """An observation of a composite or discrete space as a flat array."""
+        where = None
+        with contextlib.suppress(Exception):  # an observation may be anything
+            where = misfit(space, obs)
+            value = np.asarray(spaces.flatten(space, obs))
+            if where is None and value.shape == (self._size,):
+                return value
+        raise self._fault(f"the observation does not fit its space {short(space)}{f' at {where}' if where else ''}")
+
+    def _named(self, entry: int) -> str:
+        """The name of an entry in brackets, if it has one."""
+        name = observation_names(self.inner, self.inner_observation_space, self.task.name)[entry]
+        return "" if name == f"entry {entry}" else f" ({name})"
 
     def _number(self, reward: Any) -> float:
         value = as_array(reward)

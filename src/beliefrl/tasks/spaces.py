@@ -113,15 +113,30 @@ def flat_bounds(space: Any) -> spaces.Box:
     return flat
 
 
-def fits(space: Any, obs: Any) -> bool:
-    """Whether the parts of an observation have the sizes of their spaces, and integers where these have integers.
+def misfit(space: Any, obs: Any, path: str = "") -> str | None:
+    """The first part of an observation, such as "['imu']", that does not fit its space; None if all of them do.
 
-    `flatten` checks neither, and casts numbers to the type of the space.
+    A part must have the size of its space, and integers where this has integers. `flatten` checks neither, and casts
+    numbers to the type of the space. "" is the whole observation.
     """
-    if isinstance(space, spaces.Dict):
-        return all(fits(part, obs[name]) for name, part in space.items())
-    if isinstance(space, spaces.Tuple):
-        return all(fits(part, value) for part, value in zip(space, obs, strict=True))
+    if not isinstance(space, spaces.Dict | spaces.Tuple):
+        return None if _leaf_fits(space, obs) else path
+    parts = dict(space.items()) if isinstance(space, spaces.Dict) else dict(enumerate(space))
+    if isinstance(space, spaces.Tuple) and len(obs) != len(parts):
+        return path
+    for key, part in parts.items():
+        where = f"{path}[{key!r}]"
+        try:
+            found = misfit(part, obs[key], where)
+        except (KeyError, IndexError, TypeError):
+            return where
+        if found is not None:
+            return found
+    return None
+
+
+def _leaf_fits(space: Any, obs: Any) -> bool:
+    """Whether a value fits an elementary space."""
     if isinstance(space, spaces.Box):
         part = as_array(obs)
         if part.dtype.kind not in "biuf" or part.size != np.prod(space.shape, dtype=int):

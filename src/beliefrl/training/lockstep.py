@@ -24,7 +24,7 @@ from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.seen_environment import Environment
 from beliefrl.tasks.settings import settings_kept
 from beliefrl.training.environment_process import CLOSING, Factory
-from beliefrl.types import UserError
+from beliefrl.types import UserError, said
 
 HANDOVER = 5e-4  # approximate seconds for passing a step to other processes
 SLOW = 60.0  # seconds after which a call that has not returned is reported
@@ -106,7 +106,15 @@ class Lockstep:
         settings: dict[str, Any] = {"context": "spawn", "daemon": False, "autoreset_mode": AutoresetMode.DISABLED}
         self._envs = AsyncVectorEnv.__new__(AsyncVectorEnv)  # so that its processes can be ended if one cannot start
         with settings_kept():  # an environment is made here too, to see its spaces
-            AsyncVectorEnv.__init__(self._envs, factories, **settings)
+            try:
+                AsyncVectorEnv.__init__(self._envs, factories, **settings)
+            except (UserError, EOFError, ConnectionError):
+                raise
+            except Exception as error:  # such as an object that cannot be sent to a process
+                raise UserError(
+                    f"{self.task.name} cannot be sent to a process of its own ({said(error)}): make such objects in "
+                    "its function or class, or use processes=never."
+                ) from None
         atexit.register(self.close)  # at its exit Python would wait for processes that ignore SIGTERM
 
     def reset(self, seeds: Int[np.ndarray, " lane"]) -> Any:
