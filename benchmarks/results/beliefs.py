@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from beliefrl.training.evaluation import restore_seed
+from beliefrl.training.restore import restore_seed
 from beliefrl.types import perception
 from beliefrl.viewing.episodes import Player
 

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from beliefrl.models.window_loss import states
-from beliefrl.training.evaluation import restore_seed
+from beliefrl.training.restore import restore_seed
 from beliefrl.types import Window
 from beliefrl.viewing.episodes import Player
 

@@ -31,7 +31,8 @@ if TYPE_CHECKING:
     from beliefrl.tasks.environment import TaskEnvironment
     from beliefrl.tasks.faults import Faults
     from beliefrl.tasks.gymnasium import GymnasiumTask
-    from beliefrl.training.evaluation import evaluate, task_of
+    from beliefrl.training.evaluation import evaluate
+    from beliefrl.training.restore import task_of
     from beliefrl.training.schedule import Event
     from beliefrl.training.stop import Stopped
     from beliefrl.training.train import resume, train
@@ -133,7 +134,7 @@ _HOMES = {
     "predictions": "viewing.prediction:predictions",
     "resume": "training.train:resume",
     "sweep": "sweeps.run:sweep",
-    "task_of": "training.evaluation:task_of",
+    "task_of": "training.restore:task_of",
     "train": "training.train:train",
     "tune": "sweeps.tune:tune",
     "video": "viewing.films:video",

@@ -30,7 +30,7 @@ from beliefrl.tasks.environment import TaskEnvironment
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.interface import Interface
 from beliefrl.tasks.spaces import scale
-from beliefrl.training.evaluation import check_interface, restore_policy, task_of
+from beliefrl.training.restore import check_interface, restore_policy, task_of
 from beliefrl.types import LARGEST, Spec, Timestep, UserError, check_whole
 
 State = tuple[np.ndarray, ...]

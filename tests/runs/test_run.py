@@ -207,7 +207,7 @@ def test_options_outside_their_range_are_refused_with_the_file_and_the_name(tmp_
 
 OTHER_TYPES = """
 import json, pathlib, sys
-from beliefrl.training.evaluation import agent_of
+from beliefrl.training.restore import agent_of
 from beliefrl.runs.run import Run
 from beliefrl.training.summary import summary
 from beliefrl.training.rollout import Episode

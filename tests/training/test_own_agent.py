@@ -19,7 +19,7 @@ from beliefrl.models.nets import Gaussian
 from beliefrl.runs import arrays
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import phases
-from beliefrl.training.evaluation import agent_of
+from beliefrl.training.restore import agent_of
 from beliefrl.types import UserError, perception, plain
 from worlds import Counter, Counting, CountingAgent
 

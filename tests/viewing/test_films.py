@@ -17,7 +17,7 @@ from beliefrl import tasks
 from beliefrl.cli import main
 from beliefrl.commands import pictures
 from beliefrl.tasks.gymnasium import GymnasiumTask
-from beliefrl.training.evaluation import restore_seed
+from beliefrl.training.restore import restore_seed
 from beliefrl.types import UserError
 from beliefrl.viewing import demo, films
 from worlds import Counter, saved

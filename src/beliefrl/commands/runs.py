@@ -65,7 +65,7 @@ def show(argv: Sequence[str]) -> None:
     from beliefrl.agents import is_own
     from beliefrl.runs.run import Run
     from beliefrl.training.display import results_table, run_table
-    from beliefrl.training.evaluation import agent_of
+    from beliefrl.training.restore import agent_of
 
     run, console = Run(options.run), Console()
     agent = None if is_own(run.config["agent"]) else agent_of(run)  # a user's own class is not needed
@@ -110,7 +110,7 @@ def evaluate(argv: Sequence[str]) -> None:
 def _changed_task(run: "Run", options: EvaluateOptions) -> Any:
     """The run's task with the constants and faults of the options; None if there are none."""
     from beliefrl import tasks
-    from beliefrl.training.evaluation import task_of
+    from beliefrl.training.restore import task_of
     from beliefrl.types import tuples
 
     if not options.constants and not options.faults:

@@ -17,7 +17,7 @@ from beliefrl.runs.best import evaluations
 from beliefrl.runs.checkpoint import listed
 from beliefrl.runs.records import finite_mean, finite_or_none, sessions
 from beliefrl.runs.run import Run
-from beliefrl.training.evaluation import as_argument
+from beliefrl.training.restore import as_argument
 from beliefrl.training.schedule import Event, Phase
 from beliefrl.training.screen import Screen, duration
 from beliefrl.training.summary import MODES

@@ -20,8 +20,8 @@ from beliefrl.runs.options import Options
 from beliefrl.runs.run import Run
 from beliefrl.training import rollout
 from beliefrl.training.checks import about_task, decisive
-from beliefrl.training.evaluation import check_interface
 from beliefrl.training.replay import Replay
+from beliefrl.training.restore import check_interface
 from beliefrl.types import Spec, UserError, plain
 
 FILE = "initial-replay.safetensors"

@@ -26,8 +26,8 @@ from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import initial, log
 from beliefrl.training import replay as ring
 from beliefrl.training.compilation import keep_compiled
-from beliefrl.training.evaluation import as_argument
 from beliefrl.training.phases import SeedState
+from beliefrl.training.restore import as_argument
 from beliefrl.training.schedule import Event, Phase, Snapshot, TrainingProgress, stages
 from beliefrl.training.stop import Requests, Stopped
 from beliefrl.types import UserError, cause

@@ -17,8 +17,8 @@ from beliefrl.runs.run import Recorder, Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import checks, initial, initial_replay
-from beliefrl.training.evaluation import agent_of, check_interface, task_of
 from beliefrl.training.phases import SeedState
+from beliefrl.training.restore import agent_of, check_interface, task_of
 from beliefrl.training.schedule import Event, Options, Snapshot, capacity
 from beliefrl.training.session import Callback, Session
 from beliefrl.types import UserError, tuples

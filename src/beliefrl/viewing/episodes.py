@@ -31,7 +31,7 @@ from beliefrl.tasks.environment import TaskEnvironment
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.interface import measure_of
 from beliefrl.tasks.seen_environment import Environment
-from beliefrl.training.evaluation import check_interface, restore_seed, task_of
+from beliefrl.training.restore import check_interface, restore_seed, task_of
 from beliefrl.types import LARGEST, Timestep, UserError, check_whole, said
 
 Pixels = UInt8[np.ndarray, "height width 3"]

@@ -26,7 +26,7 @@ from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.drawing import INK, PAPER, Viewer
 from beliefrl.tasks.gymnasium import GymnasiumTask
-from beliefrl.training.evaluation import restore_seed
+from beliefrl.training.restore import restore_seed
 from beliefrl.types import LARGEST, UserError, cause, check_whole
 from beliefrl.viewing.episodes import Frame, Pixels, Player, Trajectory, check_episode, pace_of
 

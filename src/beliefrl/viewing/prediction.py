@@ -31,7 +31,7 @@ from beliefrl.models.nets import Gaussian
 from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import GymnasiumTask
-from beliefrl.training.evaluation import restore_seed
+from beliefrl.training.restore import restore_seed
 from beliefrl.types import Timestep, UserError, check_whole, perception
 from beliefrl.viewing.episodes import Player, check_episode
 
