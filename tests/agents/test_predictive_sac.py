@@ -11,9 +11,9 @@ import pytest
 from beliefrl.agents.predictive_sac import Note, PredictiveSACAgent
 from beliefrl.models import double_q, reading
 from beliefrl.models.double_q import Policy
-from beliefrl.models.nets import standardise
 from beliefrl.models.pool import draw
-from beliefrl.models.predictive_model import Usual, init_model, prediction_loss, remember
+from beliefrl.models.predictive_model import init_model, prediction_loss, remember
+from beliefrl.models.scales import Usual, standardise
 from beliefrl.types import Reading, UserError
 from inputs import SPEC, changed_where_missing, same, windows
 

@@ -13,8 +13,9 @@ from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents import Metrics
 from beliefrl.agents.hyperparameters import Range
-from beliefrl.models.nets import RunningStatistics, standardise, tanh_gaussian, update_statistics
+from beliefrl.models.nets import tanh_gaussian
 from beliefrl.models.returns import transition_batch
+from beliefrl.models.scales import RunningStatistics, standardise, update_statistics
 from beliefrl.models.soft_actor_critic import (
     Batch,
     Controller,

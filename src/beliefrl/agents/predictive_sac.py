@@ -26,14 +26,13 @@ from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents import Metrics
 from beliefrl.agents.base import ControllerAgent, Range
-from beliefrl.models import average, double_q, pool, reading
+from beliefrl.models import average, double_q, pool, predictive_model, reading
 from beliefrl.models.average import Average
 from beliefrl.models.double_q import DoubleQController, Samples
-from beliefrl.models.forecast import Memory, Note, Perceived, forecast, no_memory, perceive
-from beliefrl.models.nets import Gaussian, LSTMState, descend, falling_rate, standardise, update_statistics
+from beliefrl.models.nets import Gaussian, LSTMState, descend, falling_rate
 from beliefrl.models.pool import Pool
-from beliefrl.models.predictive_model import PredictiveModel, init_model, prediction_loss
-from beliefrl.models.scales import Scales, initial_scales
+from beliefrl.models.predictive_model import Memory, Note, Perceived, PredictiveModel, perceive, prediction_loss
+from beliefrl.models.scales import Scales, initial_scales, standardise, update_statistics
 from beliefrl.models.soft_actor_critic import OptimiserState, init_optimisers, valid_mean
 from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range
 
@@ -194,8 +193,8 @@ class PredictiveSACAgent(ControllerAgent):
         key_model, key_controller = jax.random.split(key)
         remembered = spec.obs_dim * len(self.observation_memory)
         x = spec.obs_dim + spec.action_dim + self.perceive_reward + remembered
-        sizes = spec.obs_dim, spec.action_dim, x + len(self.perceived.reward_memory)
-        model = init_model(key_model, *sizes, self.d_size, self.hidden_size, self.long_memories, self.longest_memory)
+        sizes = spec.obs_dim, spec.action_dim, x + len(self.perceived.reward_memory), self.d_size, self.hidden_size
+        model = predictive_model.init_model(key_model, *sizes, self.long_memories, self.longest_memory)
         belief = self.d_size + x
         settings = self.policy_layers, self.value_layers, self.alpha_start, self.normalise_critics
         with_sigma = self.critic_likelihood > 0
@@ -223,7 +222,7 @@ class PredictiveSACAgent(ControllerAgent):
     # Acting
 
     def reset(self, spec: Spec) -> Memory:
-        return no_memory(self.d_size, spec.obs_dim, spec.action_dim, self.perceived)
+        return Memory.empty(self.d_size, spec.obs_dim, spec.action_dim, self.perceived)
 
     def act(
         self, state: State, memory: Memory, step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]
@@ -239,7 +238,7 @@ class PredictiveSACAgent(ControllerAgent):
     def predict(
         self, state: State, model: str, step: Timestep, observed: Bool[Array, " time"], key: Key[Array, ""]
     ) -> Gaussian:
-        return forecast(state.model, state.scales, step, observed, self.perceived)
+        return predictive_model.forecast(state.model, state.scales, step, observed, self.perceived)
 
     # Learning the model
 
