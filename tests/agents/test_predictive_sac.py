@@ -11,7 +11,6 @@ import pytest
 from beliefrl.agents.predictive_sac import Note, PredictiveSACAgent
 from beliefrl.models import double_q, reading
 from beliefrl.models.double_q import Policy
-from beliefrl.models.pool import draw
 from beliefrl.models.predictive_model import init_model, prediction_loss, remember
 from beliefrl.models.scales import Usual, standardise
 from beliefrl.types import Reading, UserError
@@ -370,7 +369,7 @@ def test_a_pessimism_of_0_gives_the_actor_higher_values(state, begun):
 def test_a_batch_is_standardised_and_drawn_from_all_cycles_in_the_pool(state, begun):
     after, batches, _ = begun
     assert batches.target.shape == (1, 16)
-    raw = draw(after.pool, jax.random.split(jax.random.key(2))[1], (1, 16))
+    raw = after.pool.draw(jax.random.split(jax.random.key(2))[1], (1, 16))
     np.testing.assert_allclose(batches.belief, standardise(after.scales.belief, raw.belief), rtol=1e-5, atol=1e-6)
 
     begin, seen = jax.jit(AGENT.begin_cycle), after
@@ -378,7 +377,7 @@ def test_a_batch_is_standardised_and_drawn_from_all_cycles_in_the_pool(state, be
         seen, _, _ = begin(seen, noted(windows(jax.random.key(10 + number), 2, TIME)), jax.random.key(number))
         cycles = min(number + 2, 3)
         stored = set(np.asarray(seen.pool.transitions.target)[:cycles].ravel().tolist())
-        drawn = set(np.asarray(draw(seen.pool, jax.random.key(3), (8, 64)).target).ravel().tolist())
+        drawn = set(np.asarray(seen.pool.draw(jax.random.key(3), (8, 64)).target).ravel().tolist())
         assert drawn == stored
     assert not set(np.asarray(after.pool.transitions.target[0]).tolist()) & stored  # the first cycle was replaced
 

@@ -26,12 +26,12 @@ from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents import Metrics
 from beliefrl.agents.base import ControllerAgent, Range
-from beliefrl.models import average, double_q, pool, predictive_model, reading
+from beliefrl.models import average, double_q, predictive_model, reading
 from beliefrl.models.average import Average
 from beliefrl.models.double_q import DoubleQController, Samples
 from beliefrl.models.nets import Gaussian, LSTMState, descend, falling_rate
-from beliefrl.models.pool import Pool
 from beliefrl.models.predictive_model import Memory, Note, Perceived, PredictiveModel, perceive, prediction_loss
+from beliefrl.models.reading import Pool
 from beliefrl.models.scales import Scales, initial_scales, standardise, update_statistics
 from beliefrl.models.soft_actor_critic import OptimiserState, init_optimisers, valid_mean
 from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range
@@ -204,7 +204,7 @@ class PredictiveSACAgent(ControllerAgent):
             controller,
             initial_scales(spec.obs_dim, belief, remembered),
             model.lstm.start(self.window.readers),
-            pool.empty((self.pool, self.sequences * self.seq_len), belief, spec.action_dim),
+            Pool.empty((self.pool, self.sequences * self.seq_len), belief, spec.action_dim),
             self.model_optimiser.init(model),  # pyright: ignore[reportArgumentType]
             init_optimisers(self.optimisers, controller.trained),
             average.begin((model, controller.actor)),
@@ -275,10 +275,10 @@ class PredictiveSACAgent(ControllerAgent):
         key_targets, key_draw = jax.random.split(key)
         state, belief, metrics = self.learn_model(state, windows)
         samples, likeness = self.samples(state, windows, belief, key_targets)
-        found = pool.add(state.pool, samples)
-        batches = pool.draw(found, key_draw, (self.cycle * self.updates_per_step, self.batch_size))
+        pool = state.pool.add(samples)
+        batches = pool.draw(key_draw, (self.cycle * self.updates_per_step, self.batch_size))
         batches = batches._replace(belief=standardise(state.scales.belief, batches.belief))
-        return state._replace(pool=found), batches, metrics | {"likeness": likeness}
+        return state._replace(pool=pool), batches, metrics | {"likeness": likeness}
 
     def samples(
         self, state: State, windows: Window, belief: Float[Array, "time batch belief"], key: Key[Array, ""]
