@@ -38,7 +38,7 @@ myst_heading_anchors = 3
 nitpicky = True
 nitpick_ignore_regex = [
     ("py:.*", r"(?!beliefrl\.).*"),  # names of other libraries
-    ("py:class", r"beliefrl\.models\.(soft_actor_critic\.Network|nets\.Params)"),  # type variables
+    ("py:class", r"beliefrl\.models\.(nets|optimisation)\.Params"),  # type variables
     ("py:class", r"beliefrl\.tasks\.(faults\.Draws|check_warnings\.Entry|interface\.Interface)"),  # parts of others
 ]
 

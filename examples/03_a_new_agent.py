@@ -22,7 +22,8 @@ from jaxtyping import Array, Bool, Float, Key
 
 import beliefrl
 from beliefrl.agents.base import Metrics, SACAgent, split_updates
-from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState
+from beliefrl.models.optimisation import OptimiserState
+from beliefrl.models.soft_actor_critic import Batch, Controller
 from beliefrl.types import Spec, Timestep, Window, WindowShape
 
 

@@ -13,7 +13,7 @@ The beliefs of the windows of a cycle become transitions. A pool has those of th
 and the controller's batches are drawn from it: the windows of one cycle are too few and too correlated.
 
 In training the newest weights act. Evaluations and the trained agent use averages of the last weights of the model and
-the actor (`models.average`). These fit together only if beliefs change slowly. So the model's learning rate falls.
+the actor (`models.optimisation`). These fit together only if beliefs change slowly. So the model's learning rate falls.
 """
 
 import dataclasses
@@ -26,14 +26,13 @@ from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents import Metrics
 from beliefrl.agents.base import ControllerAgent, Range
-from beliefrl.models import average, double_q, predictive_model, reading
-from beliefrl.models.average import Average
+from beliefrl.models import double_q, predictive_model, reading
 from beliefrl.models.double_q import DoubleQController, Samples
-from beliefrl.models.nets import Gaussian, LSTMState, descend, falling_rate
+from beliefrl.models.nets import Gaussian, LSTMState
+from beliefrl.models.optimisation import Average, OptimiserState, descend, falling_rate, init_optimisers, valid_mean
 from beliefrl.models.predictive_model import Memory, Note, Perceived, PredictiveModel, perceive, prediction_loss
 from beliefrl.models.reading import Pool
 from beliefrl.models.scales import Scales, initial_scales, standardise, update_statistics
-from beliefrl.models.soft_actor_critic import OptimiserState, init_optimisers, valid_mean
 from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range
 
 
@@ -207,7 +206,7 @@ class PredictiveSACAgent(ControllerAgent):
             Pool.empty((self.pool, self.sequences * self.seq_len), belief, spec.action_dim),
             self.model_optimiser.init(model),  # pyright: ignore[reportArgumentType]
             init_optimisers(self.optimisers, controller.trained),
-            average.begin((model, controller.actor)),
+            Average.begin((model, controller.actor)),
         )
 
     def networks(self, state: State) -> State:
@@ -215,7 +214,7 @@ class PredictiveSACAgent(ControllerAgent):
 
         Before the first update there are no averages, and the newest weights stay.
         """
-        model, actor = average.averaged(state.average, (state.model, state.controller.actor))
+        model, actor = state.average.or_newest((state.model, state.controller.actor))
         rest = ("readers", "pool", "model_optimiser", "controller_optimiser", "average")
         return state._replace(model=model, controller=state.controller._replace(actor=actor), **dict.fromkeys(rest, ()))
 
@@ -295,5 +294,5 @@ class PredictiveSACAgent(ControllerAgent):
         settings = {"tau": self.tau, "regulariser": self.actor_regulariser, "pessimism": self.pessimism}
         settings |= {"likelihood": self.critic_likelihood}
         controller, optimiser, metrics = double_q.update(*given, **settings, target_entropy=self.target_entropy)
-        followed = average.follow(state.average, (state.model, controller.actor), self.average_rate)
-        return state._replace(controller=controller, controller_optimiser=optimiser, average=followed), metrics
+        average = state.average.follow((state.model, controller.actor), self.average_rate)
+        return state._replace(controller=controller, controller_optimiser=optimiser, average=average), metrics

@@ -19,8 +19,9 @@ from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents import Metrics
 from beliefrl.agents.base import Range, SACAgent, for_each_update, split_updates
-from beliefrl.models.nets import LSTM, LSTMState, descend, draw
-from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState, soft_update, update
+from beliefrl.models.nets import LSTM, LSTMState, draw
+from beliefrl.models.optimisation import OptimiserState, descend, soft_update
+from beliefrl.models.soft_actor_critic import Batch, Controller, update
 from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range
 
 

@@ -12,8 +12,9 @@ from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents import Metrics
 from beliefrl.agents.base import SACAgent, split_updates, standardise_beliefs
+from beliefrl.models.optimisation import OptimiserState
 from beliefrl.models.scales import RunningStatistics, initial_statistics, standardise
-from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState
+from beliefrl.models.soft_actor_critic import Batch, Controller
 from beliefrl.types import Spec, Timestep, Window, WindowShape, check_range
 
 

@@ -21,8 +21,9 @@ from jaxtyping import Array, Bool, Float, Key
 from beliefrl.agents import Metrics
 from beliefrl.agents.base import Range, SACAgent, split_updates
 from beliefrl.models.latent_model import LatentModel, Latents, elbo_terms, predict
-from beliefrl.models.nets import Gaussian, descend, draw
-from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean
+from beliefrl.models.nets import Gaussian, draw
+from beliefrl.models.optimisation import OptimiserState, descend, valid_mean
+from beliefrl.models.soft_actor_critic import Batch, Controller
 from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_choice, check_range, perception
 
 

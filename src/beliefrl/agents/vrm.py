@@ -25,9 +25,10 @@ from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents import Metrics
 from beliefrl.agents.base import Range, SACAgent, split_updates, standardise_beliefs
-from beliefrl.models.nets import Gaussian, LSTMState, descend, draw
+from beliefrl.models.nets import Gaussian, LSTMState, draw
+from beliefrl.models.optimisation import OptimiserState, descend
 from beliefrl.models.scales import RunningStatistics, initial_statistics, standardise
-from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState
+from beliefrl.models.soft_actor_critic import Batch, Controller
 from beliefrl.models.variational_model import VRM, predict
 from beliefrl.models.window_loss import draw_noise, model_loss, states
 from beliefrl.types import WIDEST, Spec, Timestep, UserError, Window, WindowShape, check_choice, check_range, perception

@@ -9,14 +9,12 @@ module contains these bounds; `draw` replaces them by random weights.
 
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.models.recurrence import Cell, unroll
@@ -217,24 +215,3 @@ def tanh_gaussian(
     action = jnp.tanh(mean + sigma * noise)
     log_prob = -0.5 * (noise**2 + LOG_2PI) - log_sigma - jnp.log(1 - action**2 + TANH_EPSILON)
     return action, jnp.sum(log_prob)
-
-
-def falling_rate(first: float, updates: int, least: float) -> optax.Schedule:
-    """A learning rate that is `first` for a number of updates, and then first · updates / n, but at least `least`.
-
-    If `least` is larger than `first`, the rate is constant.
-    """
-
-    def rate(n: ArrayLike) -> Float[Array, ""]:
-        return jnp.maximum(first * updates / jnp.maximum(n, updates), min(first, least))
-
-    return rate
-
-
-def descend(
-    optimiser: optax.GradientTransformation, gradient: Params, state: optax.OptState, params: Params
-) -> tuple[Params, optax.OptState]:
-    """One step of an optimiser; returns the new parameters and its new state."""
-    tree: Any = params  # optax's types accept only its own trees
-    updates, state = optimiser.update(gradient, state, tree)  # pyright: ignore[reportArgumentType]
-    return optax.apply_updates(tree, updates), state  # pyright: ignore[reportReturnType]

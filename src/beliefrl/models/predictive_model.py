@@ -36,8 +36,8 @@ from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.models.double_q import Policy
 from beliefrl.models.nets import LSTM, MLP, Gaussian, LSTMState, draw
+from beliefrl.models.optimisation import valid_mean
 from beliefrl.models.scales import Scales
-from beliefrl.models.soft_actor_critic import valid_mean
 from beliefrl.types import Timestep
 
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from beliefrl.models.soft_actor_critic import valid_mean
+from beliefrl.models.optimisation import valid_mean
 from beliefrl.types import Timestep, Window
 
 STATISTICS_RATE = 1e-3  # smallest weight of a new batch, reached after 1 / rate batches
