@@ -520,13 +520,12 @@ def test_a_fraction_of_the_cells_begins_with_a_long_memory():
 
 
 def test_the_loss_is_the_mean_squared_error_of_valid_predictions():
-    made, keys = model(), jax.random.split(jax.random.key(1), 3)
-    d = jax.random.normal(keys[0], (5, 2, D))
-    action, target = jax.random.normal(keys[1], (4, 2, ACTION)), jax.random.normal(keys[2], (4, 2, OBS + 1))
+    made, step, keys = model(), windows(jax.random.key(2), 2, 5).step, jax.random.split(jax.random.key(1), 2)
+    inputs, target = jax.random.normal(keys[0], (5, 2, 8)), jax.random.normal(keys[1], (4, 2, OBS + 1))
     valid = jnp.ones((4, 2), bool).at[1, 0].set(False)
-    loss = jax.jit(prediction_loss)(made, d, action, target, valid)
+    loss, lstm = jax.jit(prediction_loss)(made, made.lstm.start(2), inputs, step, target, valid)
     errors = [
-        np.mean((np.asarray(made.predict(d[t, b], action[t, b])) - np.asarray(target[t, b])) ** 2)
+        np.mean((np.asarray(made.predict(lstm.d[t, b], step.prev_action[t + 1, b])) - np.asarray(target[t, b])) ** 2)
         for t in range(4)
         for b in range(2)
         if valid[t, b]

@@ -78,14 +78,24 @@ def init_model(
 
 def prediction_loss(
     model: PredictiveModel,
-    d: Float[Array, "time batch d"],
-    action: Float[Array, "length batch action"],
+    start: LSTMState,
+    inputs: Float[Array, "time batch input"],
+    step: Timestep,
     target: Float[Array, "length batch prediction"],
     valid: Bool[Array, "length batch"],
-) -> Float[Array, ""]:
-    """J_model of the transitions that begin at all timesteps but the last; mean over the valid ones."""
-    predicted = jax.vmap(jax.vmap(model.predict))(d[:-1], action)
-    return valid_mean(jnp.mean((predicted - target) ** 2, axis=-1), valid)
+) -> tuple[Float[Array, ""], LSTMState]:
+    """J_model of the valid transitions between length + 1 timesteps; also returns the states, leaves (time, batch, d).
+
+    Args:
+        model: the weights.
+        start: the state before the first timestep, leaves (batch, d).
+        inputs, step: what the LSTM reads at the timesteps, and the timesteps.
+        target: (o_{t+1}, r_t) of each transition, standardised.
+        valid: which pairs of neighbours are transitions.
+    """
+    lstm = model.lstm.unroll(start, inputs, step.is_first)
+    predicted = jax.vmap(jax.vmap(model.predict))(lstm.d[:-1], step.prev_action[1:])
+    return valid_mean(jnp.mean((predicted - target) ** 2, axis=-1), valid), lstm
 
 
 class Perceived(NamedTuple):
