@@ -85,10 +85,6 @@ class StackAgent(SACAgent):
         memory = jnp.concatenate([older[1:], step.obs[None]])
         return self.choose(state.controller.actor(memory.reshape(-1)), key, explore), memory
 
-    def note(self, memory: Float[Array, "stack obs"]) -> tuple[()]:
-        """What the replay stores with the timestep: nothing."""
-        return ()
-
     def stacks(self, windows: Window) -> Float[Array, "time batch belief"]:
         """The beliefs at every timestep of the windows, from the same memory as in acting."""
         begins = windows.step.is_first | ~windows.exists

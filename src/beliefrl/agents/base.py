@@ -167,6 +167,10 @@ class SACAgent(ControllerAgent):
         controller = init_controller(*sizes, key, actor_size, self.value_start)
         return controller, init_optimisers(self.optimisers, controller.trained)
 
+    def note(self, memory: Any) -> Any:
+        """The data that the replay stores with a timestep: none."""
+        return ()
+
     def controller_loss(
         self, controller: Controller, batch: Batch, key: Key[Array, ""]
     ) -> tuple[Float[Array, ""], Metrics]:
@@ -192,6 +196,12 @@ def standardise_beliefs(scale: RunningStatistics | None, batch: Batch) -> tuple[
     scale = update_statistics(scale, batch.belief, batch.valid)
     belief, next_belief = standardise(scale, batch.belief), standardise(scale, batch.next_belief)
     return scale, batch._replace(belief=belief, next_belief=next_belief)
+
+
+def split_windows(windows: Window, count: int) -> tuple[Window, Window]:
+    """The first `count` windows (time-major), and the others."""
+    first = jax.tree.map(lambda leaf: leaf[:, :count], windows)
+    return first, jax.tree.map(lambda leaf: leaf[:, count:], windows)
 
 
 def for_each_update(windows: Any, count: int) -> Any:

@@ -24,7 +24,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents import Metrics
-from beliefrl.agents.base import Range, SACAgent, split_updates, standardise_beliefs
+from beliefrl.agents.base import Range, SACAgent, split_updates, split_windows, standardise_beliefs
 from beliefrl.models.nets import Gaussian, LSTMState, draw
 from beliefrl.models.optimisation import OptimiserState, descend
 from beliefrl.models.scales import RunningStatistics, initial_statistics, standardise
@@ -264,9 +264,7 @@ class VRMAgent(SACAgent):
 
     def begin_cycle(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Batch, Metrics]:
         key_model, key_belief = jax.random.split(key)
-        count = self.batch_size * self.has_keep
-        for_model = jax.tree.map(lambda leaf: leaf[:, :count], windows)
-        for_controller = jax.tree.map(lambda leaf: leaf[:, count:], windows)
+        for_model, for_controller = split_windows(windows, self.batch_size * self.has_keep)
         state, metrics = self.learn_keep(state, for_model, key_model, self.stored_state(for_model))
         scale, batches = standardise_beliefs(state.scale, self.batches(state, for_controller, key_belief))
         return state._replace(scale=scale), batches, metrics
