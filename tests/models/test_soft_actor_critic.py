@@ -23,7 +23,7 @@ RATES = {"actor": 0.25, "critic": 0.5, "alpha": 0.125}
 
 @partial(jax.jit, static_argnames=("actor_size", "value_start"))
 def init(key, **options):
-    return sac.init_controller(BELIEF, ACTION, (4,), (3,), key, **options)
+    return sac.init_controller(key, BELIEF, ACTION, (4,), (3,), **options)
 
 
 @pytest.fixture(scope="module")

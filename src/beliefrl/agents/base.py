@@ -164,7 +164,7 @@ class SACAgent(ControllerAgent):
     ) -> tuple[Controller, OptimiserState]:
         """A new controller and its optimisers; `actor_size` is the actor's input size if it is not the belief."""
         sizes = belief, action, self.policy_layers, self.value_layers
-        controller = init_controller(*sizes, key, actor_size, self.value_start)
+        controller = init_controller(key, *sizes, actor_size, self.value_start)
         return controller, init_optimisers(self.optimisers, controller.trained)
 
     def note(self, memory: Any) -> Any:

@@ -94,11 +94,11 @@ class Batch(NamedTuple):
 
 
 def init_controller(
+    key: Key[Array, ""],
     belief: int,
     action: int,
     policy_layers: tuple[int, ...],
     value_layers: tuple[int, ...],
-    key: Key[Array, ""],
     actor_size: int | None = None,
     value_start: float = 0.0,
 ) -> Controller:
