@@ -81,16 +81,16 @@ class Controller(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """Transitions for one update."""
+    """Transitions; the losses take one axis `batch`."""
 
-    belief: Float[Array, "batch belief"]  # s_t
-    next_belief: Float[Array, "batch belief"]  # s_{t+1}; s_{t+m} with returns of m steps (`returns`)
-    action: Float[Array, "batch action"]  # a_t
-    reward: Float[Array, " batch"]  # r_t, or the discounted sum of m of them
-    terminated: Bool[Array, " batch"]  # `next_belief` is terminal
-    discount: Float[Array, " batch"]  # γ^m of the value at `next_belief`
-    valid: Bool[Array, " batch"]  # mask: False entries are ignored
-    actor_input: Float[Array, "batch actor_input"] | None = None  # the actor's input if it is not s_t (SLAC)
+    belief: Float[Array, "*batch belief"]  # s_t
+    next_belief: Float[Array, "*batch belief"]  # s_{t+1}; s_{t+m} with returns of m steps (`returns`)
+    action: Float[Array, "*batch action"]  # a_t
+    reward: Float[Array, "*batch"]  # r_t, or the discounted sum of m of them
+    terminated: Bool[Array, "*batch"]  # `next_belief` is terminal
+    discount: Float[Array, "*batch"]  # γ^m of the value at `next_belief`
+    valid: Bool[Array, "*batch"]  # mask: False entries are ignored
+    actor_input: Float[Array, "*batch actor_input"] | None = None  # the actor's input if it is not s_t (SLAC)
 
 
 def init_controller(
