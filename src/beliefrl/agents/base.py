@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents import Metrics
 from beliefrl.agents.hyperparameters import Range
+from beliefrl.agents.protocol import Metrics
 from beliefrl.models.nets import tanh_gaussian
 from beliefrl.models.optimisation import Optimisers, OptimiserState, init_optimisers
 from beliefrl.models.returns import transition_batch

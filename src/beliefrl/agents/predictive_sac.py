@@ -22,8 +22,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents import Metrics
 from beliefrl.agents.base import ControllerAgent, Range
+from beliefrl.agents.protocol import Metrics
 from beliefrl.models import double_q, predictive_model, reading
 from beliefrl.models.double_q import DoubleQController, Samples
 from beliefrl.models.nets import Gaussian, LSTMState

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import jax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents import Metrics
 from beliefrl.agents.base import SACAgent, standardise_beliefs
+from beliefrl.agents.protocol import Metrics
 from beliefrl.models.optimisation import OptimiserState
 from beliefrl.models.scales import RunningStatistics, initial_statistics, standardise
 from beliefrl.models.soft_actor_critic import Batch, Controller

@@ -23,8 +23,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents import Metrics
 from beliefrl.agents.base import Range, SACAgent, split_updates, split_windows, standardise_beliefs
+from beliefrl.agents.protocol import Metrics
 from beliefrl.models.nets import Gaussian, LSTMState, draw
 from beliefrl.models.optimisation import OptimiserState, descend
 from beliefrl.models.scales import RunningStatistics, initial_statistics, standardise
