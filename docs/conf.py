@@ -38,7 +38,7 @@ myst_heading_anchors = 3
 nitpicky = True
 nitpick_ignore_regex = [
     ("py:.*", r"(?!beliefrl\.).*"),  # names of other libraries
-    ("py:class", r"beliefrl\.models\.(soft_actor_critic\.Network|nets\.Params)"),  # type variables
+    ("py:class", r"beliefrl\.models\.(nets|optimisation)\.Params"),  # type variables
     ("py:class", r"beliefrl\.tasks\.(faults\.Draws|check_warnings\.Entry|interface\.Interface)"),  # parts of others
 ]
 
@@ -111,9 +111,9 @@ def without_fields(
 
 
 def skip_methods_of_agents(app: Sphinx, what: str, name: str, obj: Any, skip: bool, options: Any) -> bool | None:
-    """List only the hyperparameters of an agent. Its methods are those of the protocol, in `beliefrl.agents`."""
-    function = getattr(obj, "fget", obj)
-    return True if getattr(function, "__module__", "").startswith("beliefrl.agents.") else None
+    """List only the hyperparameters of an agent. Its methods are those of the protocol."""
+    module = getattr(getattr(obj, "fget", obj), "__module__", "")
+    return True if module.startswith("beliefrl.agents.") and module != "beliefrl.agents.protocol" else None
 
 
 def comments(field: str) -> dict[str, str]:

@@ -22,7 +22,8 @@ from jaxtyping import Array, Bool, Float, Key
 
 import beliefrl
 from beliefrl.agents.base import Metrics, SACAgent, split_updates
-from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState
+from beliefrl.models.optimisation import OptimiserState
+from beliefrl.models.soft_actor_critic import Batch, Controller
 from beliefrl.types import Spec, Timestep, Window, WindowShape
 
 
@@ -83,10 +84,6 @@ class StackAgent(SACAgent):
         older = jnp.where(step.is_first, jnp.broadcast_to(step.obs, memory.shape), memory)
         memory = jnp.concatenate([older[1:], step.obs[None]])
         return self.choose(state.controller.actor(memory.reshape(-1)), key, explore), memory
-
-    def note(self, memory: Float[Array, "stack obs"]) -> tuple[()]:
-        """What the replay stores with the timestep: nothing."""
-        return ()
 
     def stacks(self, windows: Window) -> Float[Array, "time batch belief"]:
         """The beliefs at every timestep of the windows, from the same memory as in acting."""

@@ -11,9 +11,8 @@ import pytest
 from beliefrl.agents.predictive_sac import Note, PredictiveSACAgent
 from beliefrl.models import double_q, reading
 from beliefrl.models.double_q import Policy
-from beliefrl.models.nets import standardise
-from beliefrl.models.pool import draw
-from beliefrl.models.predictive_model import Usual, init_model, prediction_loss, remember
+from beliefrl.models.predictive_model import init_model, prediction_loss, remember
+from beliefrl.models.scales import Usual, standardise
 from beliefrl.types import Reading, UserError
 from inputs import SPEC, changed_where_missing, same, windows
 
@@ -370,7 +369,7 @@ def test_a_pessimism_of_0_gives_the_actor_higher_values(state, begun):
 def test_a_batch_is_standardised_and_drawn_from_all_cycles_in_the_pool(state, begun):
     after, batches, _ = begun
     assert batches.target.shape == (1, 16)
-    raw = draw(after.pool, jax.random.split(jax.random.key(2))[1], (1, 16))
+    raw = after.pool.draw(jax.random.split(jax.random.key(2))[1], (1, 16))
     np.testing.assert_allclose(batches.belief, standardise(after.scales.belief, raw.belief), rtol=1e-5, atol=1e-6)
 
     begin, seen = jax.jit(AGENT.begin_cycle), after
@@ -378,7 +377,7 @@ def test_a_batch_is_standardised_and_drawn_from_all_cycles_in_the_pool(state, be
         seen, _, _ = begin(seen, noted(windows(jax.random.key(10 + number), 2, TIME)), jax.random.key(number))
         cycles = min(number + 2, 3)
         stored = set(np.asarray(seen.pool.transitions.target)[:cycles].ravel().tolist())
-        drawn = set(np.asarray(draw(seen.pool, jax.random.key(3), (8, 64)).target).ravel().tolist())
+        drawn = set(np.asarray(seen.pool.draw(jax.random.key(3), (8, 64)).target).ravel().tolist())
         assert drawn == stored
     assert not set(np.asarray(after.pool.transitions.target[0]).tolist()) & stored  # the first cycle was replaced
 
@@ -521,13 +520,12 @@ def test_a_fraction_of_the_cells_begins_with_a_long_memory():
 
 
 def test_the_loss_is_the_mean_squared_error_of_valid_predictions():
-    made, keys = model(), jax.random.split(jax.random.key(1), 3)
-    d = jax.random.normal(keys[0], (5, 2, D))
-    action, target = jax.random.normal(keys[1], (4, 2, ACTION)), jax.random.normal(keys[2], (4, 2, OBS + 1))
+    made, step, keys = model(), windows(jax.random.key(2), 2, 5).step, jax.random.split(jax.random.key(1), 2)
+    inputs, target = jax.random.normal(keys[0], (5, 2, 8)), jax.random.normal(keys[1], (4, 2, OBS + 1))
     valid = jnp.ones((4, 2), bool).at[1, 0].set(False)
-    loss = jax.jit(prediction_loss)(made, d, action, target, valid)
+    loss, lstm = jax.jit(prediction_loss)(made, made.lstm.start(2), inputs, step, target, valid)
     errors = [
-        np.mean((np.asarray(made.predict(d[t, b], action[t, b])) - np.asarray(target[t, b])) ** 2)
+        np.mean((np.asarray(made.predict(lstm.d[t, b], step.prev_action[t + 1, b])) - np.asarray(target[t, b])) ** 2)
         for t in range(4)
         for b in range(2)
         if valid[t, b]

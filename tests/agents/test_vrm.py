@@ -10,7 +10,7 @@ import pytest
 
 from beliefrl import agents
 from beliefrl.agents.vrm import VRMAgent
-from beliefrl.models.nets import initial_statistics, standardise
+from beliefrl.models.scales import initial_statistics, standardise
 from beliefrl.models.variational_model import VRM
 from beliefrl.models.window_loss import draw_noise, model_loss, states
 from beliefrl.types import Timestep, UserError, Window, check_choice, perception

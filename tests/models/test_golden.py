@@ -11,7 +11,8 @@ import pytest
 
 from beliefrl.agents.sac_mlp import SACMLPAgent
 from beliefrl.models.nets import MLP, gaussian_log_prob
-from beliefrl.models.soft_actor_critic import Actor, Batch, Controller, loss, soft_update
+from beliefrl.models.optimisation import soft_update
+from beliefrl.models.soft_actor_critic import Actor, Batch, Controller, loss
 from beliefrl.models.variational_model import VRM, elbo_terms
 from beliefrl.types import Timestep, Window
 

@@ -8,18 +8,15 @@ from beliefrl.models import latent_model, nets, variational_model
 from beliefrl.models.nets import (
     MLP,
     LSTMState,
-    RunningStatistics,
     draw,
     gaussian_kl,
     gaussian_log_prob,
-    initial_statistics,
     lstm_step,
     lstm_step_backward,
-    standardise,
     tanh_gaussian,
-    update_statistics,
 )
 from beliefrl.models.recurrence import unroll
+from beliefrl.models.scales import RunningStatistics, initial_statistics, standardise, update_statistics
 from inputs import random_like
 
 

@@ -13,7 +13,8 @@ from beliefrl.models import double_q
 from beliefrl.models import soft_actor_critic as sac
 from beliefrl.models.double_q import Policy, Samples, Unit
 from beliefrl.models.nets import tanh_gaussian
-from beliefrl.models.soft_actor_critic import Actor, Batch, Optimisers, init_optimisers
+from beliefrl.models.optimisation import Optimisers, init_optimisers, valid_mean
+from beliefrl.models.soft_actor_critic import Actor, Batch
 from beliefrl.types import Timestep
 
 BELIEF, ACTION, ROWS = 5, 2, 6
@@ -22,7 +23,7 @@ RATES = {"actor": 0.25, "critic": 0.5, "alpha": 0.125}
 
 @partial(jax.jit, static_argnames=("actor_size", "value_start"))
 def init(key, **options):
-    return sac.init_controller(BELIEF, ACTION, (4,), (3,), key, **options)
+    return sac.init_controller(key, BELIEF, ACTION, (4,), (3,), **options)
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +80,7 @@ def test_log_sigma_is_clipped(controller, bias, clipped):
 
 
 def test_the_mean_counts_what_is_valid_and_is_zero_where_nothing_is():
-    mean, x = jax.jit(sac.valid_mean), jnp.array([1.0, jnp.nan, 4.0])
+    mean, x = jax.jit(valid_mean), jnp.array([1.0, jnp.nan, 4.0])
     assert float(mean(x, jnp.array([True, False, True]))) == 2.5
     assert float(mean(x, jnp.array([True, False, False]))) == 1.0
     assert float(mean(x, jnp.zeros(3, bool))) == 0.0

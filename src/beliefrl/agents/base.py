@@ -11,20 +11,13 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents import Metrics
 from beliefrl.agents.hyperparameters import Range
-from beliefrl.models.nets import RunningStatistics, standardise, tanh_gaussian, update_statistics
+from beliefrl.agents.protocol import Metrics
+from beliefrl.models.nets import tanh_gaussian
+from beliefrl.models.optimisation import Optimisers, OptimiserState, init_optimisers
 from beliefrl.models.returns import transition_batch
-from beliefrl.models.soft_actor_critic import (
-    Batch,
-    Controller,
-    Optimisers,
-    OptimiserState,
-    init_controller,
-    init_optimisers,
-    loss,
-    update,
-)
+from beliefrl.models.scales import RunningStatistics, standardise, update_statistics
+from beliefrl.models.soft_actor_critic import Batch, Controller, init_controller, loss, update
 from beliefrl.types import LARGEST, WIDEST, UserError, Window, WindowShape, check_choice, check_range, transitions
 
 MOST_STEPS = 64  # of an n-step return; each step is compiled
@@ -171,8 +164,12 @@ class SACAgent(ControllerAgent):
     ) -> tuple[Controller, OptimiserState]:
         """A new controller and its optimisers; `actor_size` is the actor's input size if it is not the belief."""
         sizes = belief, action, self.policy_layers, self.value_layers
-        controller = init_controller(*sizes, key, actor_size, self.value_start)
+        controller = init_controller(key, *sizes, actor_size, self.value_start)
         return controller, init_optimisers(self.optimisers, controller.trained)
+
+    def note(self, memory: Any) -> Any:
+        """The data that the replay stores with a timestep: none."""
+        return ()
 
     def controller_loss(
         self, controller: Controller, batch: Batch, key: Key[Array, ""]
@@ -199,6 +196,12 @@ def standardise_beliefs(scale: RunningStatistics | None, batch: Batch) -> tuple[
     scale = update_statistics(scale, batch.belief, batch.valid)
     belief, next_belief = standardise(scale, batch.belief), standardise(scale, batch.next_belief)
     return scale, batch._replace(belief=belief, next_belief=next_belief)
+
+
+def split_windows(windows: Window, count: int) -> tuple[Window, Window]:
+    """The first `count` windows (time-major), and the others."""
+    first = jax.tree.map(lambda leaf: leaf[:, :count], windows)
+    return first, jax.tree.map(lambda leaf: leaf[:, count:], windows)
 
 
 def for_each_update(windows: Any, count: int) -> Any:

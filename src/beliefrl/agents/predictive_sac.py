@@ -5,15 +5,13 @@ running statistics. n_t is a memory of the observations of the episode, which is
 memory of its unusual rewards. It learns during the whole training, and only by predicting the next observation and
 reward (`models.predictive_model`). The gradient of the controller (`models.double_q`) does not reach it.
 
-The model reads the replay in order (`training.replay.Readers`): a reader's window begins with the state at the end of
-its last one. So h_t knows the episode since its beginning, or since the reader's last jump, which empties it. Both
-memories know the whole episode, because the replay stores them.
-
-The beliefs of the windows of a cycle become transitions. A pool has those of the last `pool` cycles with their targets,
-and the controller's batches are drawn from it: the windows of one cycle are too few and too correlated.
+The model reads the replay in order (`models.reading`): a reader's window begins with the state at the end of its last
+one. So h_t knows the episode since its beginning, or since the reader's last jump, which empties it. The beliefs of the
+windows of a cycle become transitions. A pool has those of the last `pool` cycles with their targets, and the
+controller's batches are drawn from it: the windows of one cycle are too few and too correlated.
 
 In training the newest weights act. Evaluations and the trained agent use averages of the last weights of the model and
-the actor (`models.average`). These fit together only if beliefs change slowly. So the model's learning rate falls.
+the actor (`models.optimisation`). These fit together only if beliefs change slowly. So the model's learning rate falls.
 """
 
 import dataclasses
@@ -24,17 +22,15 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents import Metrics
 from beliefrl.agents.base import ControllerAgent, Range
-from beliefrl.models import average, double_q, pool, reading
-from beliefrl.models.average import Average
+from beliefrl.agents.protocol import Metrics
+from beliefrl.models import double_q, predictive_model, reading
 from beliefrl.models.double_q import DoubleQController, Samples
-from beliefrl.models.forecast import Memory, Note, Perceived, forecast, no_memory, perceive
-from beliefrl.models.nets import Gaussian, LSTMState, descend, falling_rate, standardise, update_statistics
-from beliefrl.models.pool import Pool
-from beliefrl.models.predictive_model import PredictiveModel, init_model, prediction_loss
-from beliefrl.models.scales import Scales, initial_scales
-from beliefrl.models.soft_actor_critic import OptimiserState, init_optimisers, valid_mean
+from beliefrl.models.nets import Gaussian, LSTMState
+from beliefrl.models.optimisation import Average, OptimiserState, descend, falling_rate, init_optimisers, valid_mean
+from beliefrl.models.predictive_model import Memory, Note, Perceived, PredictiveModel, perceive, prediction_loss
+from beliefrl.models.reading import Pool
+from beliefrl.models.scales import Scales, initial_scales, standardise, update_statistics
 from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range
 
 
@@ -141,6 +137,7 @@ class PredictiveSACAgent(ControllerAgent):
         "pool": (4, 8, 16),
     }
     predictors = ("lstm",)
+    losses = ("loss_q", "loss_actor", "loss_model")
     values_before = {
         "normalise_critics": False,
         "lr_model_min": 1.0,
@@ -170,10 +167,6 @@ class PredictiveSACAgent(ControllerAgent):
         return WindowShape(0, self.seq_len, self.pool * self.sequences, self.jump)
 
     @property
-    def losses(self) -> tuple[str, ...]:
-        return "loss_q", "loss_actor", "loss_model"
-
-    @property
     def pretrain_windows(self) -> int:
         return self.sequences
 
@@ -194,21 +187,20 @@ class PredictiveSACAgent(ControllerAgent):
         key_model, key_controller = jax.random.split(key)
         remembered = spec.obs_dim * len(self.observation_memory)
         x = spec.obs_dim + spec.action_dim + self.perceive_reward + remembered
-        sizes = spec.obs_dim, spec.action_dim, x + len(self.perceived.reward_memory)
-        model = init_model(key_model, *sizes, self.d_size, self.hidden_size, self.long_memories, self.longest_memory)
-        belief = self.d_size + x
+        sizes = spec.obs_dim, spec.action_dim, x + len(self.perceived.reward_memory), self.d_size, self.hidden_size
+        model = predictive_model.init_model(key_model, *sizes, self.long_memories, self.longest_memory)
+        belief, action = self.d_size + x, spec.action_dim
         settings = self.policy_layers, self.value_layers, self.alpha_start, self.normalise_critics
-        with_sigma = self.critic_likelihood > 0
-        controller = double_q.init_controller(key_controller, belief, spec.action_dim, *settings, with_sigma)
+        controller = double_q.init_controller(key_controller, belief, action, *settings, self.critic_likelihood > 0)
         return State(
             model,
             controller,
             initial_scales(spec.obs_dim, belief, remembered),
             model.lstm.start(self.window.readers),
-            pool.empty((self.pool, self.sequences * self.seq_len), belief, spec.action_dim),
+            Pool.empty((self.pool, self.sequences * self.seq_len), belief, action),
             self.model_optimiser.init(model),  # pyright: ignore[reportArgumentType]
             init_optimisers(self.optimisers, controller.trained),
-            average.begin((model, controller.actor)),
+            Average.begin((model, controller.actor)),
         )
 
     def networks(self, state: State) -> State:
@@ -216,14 +208,14 @@ class PredictiveSACAgent(ControllerAgent):
 
         Before the first update there are no averages, and the newest weights stay.
         """
-        model, actor = average.averaged(state.average, (state.model, state.controller.actor))
+        model, actor = state.average.or_newest((state.model, state.controller.actor))
         rest = ("readers", "pool", "model_optimiser", "controller_optimiser", "average")
         return state._replace(model=model, controller=state.controller._replace(actor=actor), **dict.fromkeys(rest, ()))
 
     # Acting
 
     def reset(self, spec: Spec) -> Memory:
-        return no_memory(self.d_size, spec.obs_dim, spec.action_dim, self.perceived)
+        return Memory.empty(self.d_size, spec.obs_dim, spec.action_dim, self.perceived)
 
     def act(
         self, state: State, memory: Memory, step: Timestep, key: Key[Array, ""], explore: Bool[Array, ""]
@@ -239,7 +231,7 @@ class PredictiveSACAgent(ControllerAgent):
     def predict(
         self, state: State, model: str, step: Timestep, observed: Bool[Array, " time"], key: Key[Array, ""]
     ) -> Gaussian:
-        return forecast(state.model, state.scales, step, observed, self.perceived)
+        return predictive_model.forecast(state.model, state.scales, step, observed, self.perceived)
 
     # Learning the model
 
@@ -251,16 +243,13 @@ class PredictiveSACAgent(ControllerAgent):
 
     def learn_model(self, state: State, windows: Window) -> tuple[State, Float[Array, "time batch belief"], Metrics]:
         """One Adam step on J_model; also returns the beliefs, formed before the step and not standardised."""
-        scales, step, after = state.scales.include(windows), windows.step, windows.between(1, None).step
+        scales, step = state.scales.include(windows), windows.step
         x = scales.perception(step, windows.note.observations, self.perceive_reward)
         valid = reading.known_transitions(windows)
         inputs, start = scales.model_input(x, windows.note.rewards), reading.start(windows, state.readers)
-
-        def loss(model: PredictiveModel) -> tuple[Float[Array, ""], LSTMState]:
-            lstm = model.lstm.unroll(start, inputs, step.is_first)
-            return prediction_loss(model, lstm.d, after.prev_action, scales.prediction(after), valid), lstm
-
-        (j_model, lstm), gradient = jax.value_and_grad(loss, has_aux=True)(state.model)
+        (j_model, lstm), gradient = jax.value_and_grad(prediction_loss, has_aux=True)(
+            state.model, start, inputs, step, scales.prediction(windows.between(1, None).step), valid
+        )
         model, optimiser = descend(self.model_optimiser, gradient, state.model_optimiser, state.model)
         belief = jnp.concatenate([lstm.d, x], axis=-1)
         known = windows.exists & reading.is_known(windows)
@@ -275,26 +264,36 @@ class PredictiveSACAgent(ControllerAgent):
         """One update of the model; then a batch from the pool for each update of the controller."""
         key_targets, key_draw = jax.random.split(key)
         state, belief, metrics = self.learn_model(state, windows)
-        samples, likeness = self.samples(state, windows, belief, key_targets)
-        found = pool.add(state.pool, samples)
-        batches = pool.draw(found, key_draw, (self.cycle * self.updates_per_step, self.batch_size))
+        valid = reading.known_transitions(windows)
+        y, likeness = double_q.critic_targets(
+            state.controller,
+            standardise(state.scales.belief, belief),
+            windows.step,
+            valid,
+            windows.note.policy,
+            key_targets,
+            gamma=self.gamma,
+            decay=self.trace_decay,
+            off_policy=self.off_policy_trace,
+            pessimism=self.pessimism,
+        )
+        pool = state.pool.add(Samples(belief[:-1], windows.step.prev_action[1:], y, valid))
+        batches = pool.draw(key_draw, (self.cycle * self.updates_per_step, self.batch_size))
         batches = batches._replace(belief=standardise(state.scales.belief, batches.belief))
-        return state._replace(pool=found), batches, metrics | {"likeness": likeness}
-
-    def samples(
-        self, state: State, windows: Window, belief: Float[Array, "time batch belief"], key: Key[Array, ""]
-    ) -> tuple[Samples, Float[Array, ""]]:
-        """The transitions of windows with their targets; also the mean of min(1, π / b)."""
-        valid, s = reading.known_transitions(windows), standardise(state.scales.belief, belief)
-        step, b = windows.step, windows.note.policy
-        settings = {"decay": self.trace_decay, "off_policy": self.off_policy_trace, "pessimism": self.pessimism}
-        y, likeness = double_q.critic_targets(state.controller, s, step, valid, b, key, gamma=self.gamma, **settings)
-        return Samples(belief[:-1], step.prev_action[1:], y, valid), valid_mean(likeness, valid)
+        return state._replace(pool=pool), batches, metrics | {"likeness": valid_mean(likeness, valid)}
 
     def update(self, state: State, batch: Samples, key: Key[Array, ""]) -> tuple[State, Metrics]:
-        given = self.optimisers, state.controller_optimiser, state.controller, batch, key
-        settings = {"tau": self.tau, "regulariser": self.actor_regulariser, "pessimism": self.pessimism}
-        settings |= {"likelihood": self.critic_likelihood}
-        controller, optimiser, metrics = double_q.update(*given, **settings, target_entropy=self.target_entropy)
-        followed = average.follow(state.average, (state.model, controller.actor), self.average_rate)
-        return state._replace(controller=controller, controller_optimiser=optimiser, average=followed), metrics
+        controller, optimiser, metrics = double_q.update(
+            self.optimisers,
+            state.controller_optimiser,
+            state.controller,
+            batch,
+            key,
+            tau=self.tau,
+            regulariser=self.actor_regulariser,
+            pessimism=self.pessimism,
+            likelihood=self.critic_likelihood,
+            target_entropy=self.target_entropy,
+        )
+        average = state.average.follow((state.model, controller.actor), self.average_rate)
+        return state._replace(controller=controller, controller_optimiser=optimiser, average=average), metrics

@@ -17,10 +17,11 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents import Metrics
-from beliefrl.agents.base import Range, SACAgent, for_each_update, split_updates
-from beliefrl.models.nets import LSTM, LSTMState, descend, draw
-from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState, soft_update, update
+from beliefrl.agents.base import Range, SACAgent, for_each_update
+from beliefrl.agents.protocol import Metrics
+from beliefrl.models.nets import LSTM, LSTMState, draw
+from beliefrl.models.optimisation import OptimiserState, descend, soft_update
+from beliefrl.models.soft_actor_critic import Batch, Controller, update
 from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range
 
 
@@ -122,9 +123,6 @@ class SACLSTMAgent(SACAgent):
         memory = state.lstm.step(memory, self.perception(step), step.is_first)
         return self.choose(state.controller.actor(memory.d), key, explore), memory
 
-    def note(self, memory: LSTMState) -> tuple[()]:
-        return ()
-
     # Learning
 
     def pretrain(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Metrics]:
@@ -153,7 +151,7 @@ class SACLSTMAgent(SACAgent):
     ) -> Batch:
         """The windows' transitions, with beliefs for the critics, for the actor (the same numbers) and for V̄."""
         batch = self.transitions(windows, d, d_target, d_actor)
-        return jax.tree.map(lambda leaf: leaf[0], split_updates(batch, self.batch_size))
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), batch)
 
     def gradients(
         self, lstm: LSTM, target_lstm: LSTM, controller: Controller, windows: Window, key: Key[Array, ""]

@@ -10,10 +10,11 @@ from typing import NamedTuple
 import jax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents import Metrics
-from beliefrl.agents.base import SACAgent, split_updates, standardise_beliefs
-from beliefrl.models.nets import RunningStatistics, initial_statistics, standardise
-from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState
+from beliefrl.agents.base import SACAgent, standardise_beliefs
+from beliefrl.agents.protocol import Metrics
+from beliefrl.models.optimisation import OptimiserState
+from beliefrl.models.scales import RunningStatistics, initial_statistics, standardise
+from beliefrl.models.soft_actor_critic import Batch, Controller
 from beliefrl.types import Spec, Timestep, Window, WindowShape, check_range
 
 
@@ -74,9 +75,6 @@ class SACMLPAgent(SACAgent):
         policy = state.controller.actor(standardise(state.scale, step.obs))
         return self.choose(policy, key, explore), memory
 
-    def note(self, memory: tuple[()]) -> tuple[()]:
-        return ()
-
     def pretrain(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Metrics]:
         scale, batch = standardise_beliefs(state.scale, self.batch(windows))
         return self.update(state._replace(scale=scale), batch, key)
@@ -84,11 +82,8 @@ class SACMLPAgent(SACAgent):
     def begin_cycle(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Batch, Metrics]:
         """The batch of each update."""
         scale, batch = standardise_beliefs(state.scale, self.batch(windows))
-        return (
-            state._replace(scale=scale),
-            split_updates(jax.tree.map(lambda leaf: leaf[None], batch), self.batch_size),
-            {},
-        )
+        batches = jax.tree.map(lambda leaf: leaf.reshape(-1, self.batch_size, *leaf.shape[1:]), batch)
+        return state._replace(scale=scale), batches, {}
 
     def batch(self, windows: Window) -> Batch:
         """The windows' first transitions."""

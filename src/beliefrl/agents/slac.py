@@ -18,11 +18,12 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents import Metrics
-from beliefrl.agents.base import Range, SACAgent, split_updates
+from beliefrl.agents.base import Range, SACAgent, split_updates, split_windows
+from beliefrl.agents.protocol import Metrics
 from beliefrl.models.latent_model import LatentModel, Latents, elbo_terms, predict
-from beliefrl.models.nets import Gaussian, descend, draw
-from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState, valid_mean
+from beliefrl.models.nets import Gaussian, draw
+from beliefrl.models.optimisation import OptimiserState, descend, valid_mean
+from beliefrl.models.soft_actor_critic import Batch, Controller
 from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_choice, check_range, perception
 
 
@@ -139,9 +140,6 @@ class SLACAgent(SACAgent):
         memory = jnp.where(step.is_first, x[None], jnp.concatenate([memory[1:], x[None]]))
         return self.choose(state.controller.actor(memory.ravel()), key, explore), memory
 
-    def note(self, memory: Float[Array, "history x"]) -> tuple[()]:
-        return ()
-
     # Predicting
 
     @property
@@ -187,8 +185,7 @@ class SLACAgent(SACAgent):
 
     def begin_cycle(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Batch, Metrics]:
         key_model, key_belief = jax.random.split(key)
-        for_model = jax.tree.map(lambda leaf: leaf[:, : self.batch_size], windows)
-        for_controller = jax.tree.map(lambda leaf: leaf[:, self.batch_size :], windows)
+        for_model, for_controller = split_windows(windows, self.batch_size)
         batches = self.batches(state.model, for_controller, key_belief)
         state, metrics = self.pretrain(state, for_model, key_model)
         return state, batches, metrics

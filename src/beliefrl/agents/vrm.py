@@ -23,10 +23,12 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents import Metrics
-from beliefrl.agents.base import Range, SACAgent, split_updates, standardise_beliefs
-from beliefrl.models.nets import Gaussian, LSTMState, RunningStatistics, descend, draw, initial_statistics, standardise
-from beliefrl.models.soft_actor_critic import Batch, Controller, OptimiserState
+from beliefrl.agents.base import Range, SACAgent, split_updates, split_windows, standardise_beliefs
+from beliefrl.agents.protocol import Metrics
+from beliefrl.models.nets import Gaussian, LSTMState, draw
+from beliefrl.models.optimisation import OptimiserState, descend
+from beliefrl.models.scales import RunningStatistics, initial_statistics, standardise
+from beliefrl.models.soft_actor_critic import Batch, Controller
 from beliefrl.models.variational_model import VRM, predict
 from beliefrl.models.window_loss import draw_noise, model_loss, states
 from beliefrl.types import WIDEST, Spec, Timestep, UserError, Window, WindowShape, check_choice, check_range, perception
@@ -262,9 +264,7 @@ class VRMAgent(SACAgent):
 
     def begin_cycle(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Batch, Metrics]:
         key_model, key_belief = jax.random.split(key)
-        count = self.batch_size * self.has_keep
-        for_model = jax.tree.map(lambda leaf: leaf[:, :count], windows)
-        for_controller = jax.tree.map(lambda leaf: leaf[:, count:], windows)
+        for_model, for_controller = split_windows(windows, self.batch_size * self.has_keep)
         state, metrics = self.learn_keep(state, for_model, key_model, self.stored_state(for_model))
         scale, batches = standardise_beliefs(state.scale, self.batches(state, for_controller, key_belief))
         return state._replace(scale=scale), batches, metrics

@@ -38,19 +38,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.models.nets import MLP, draw, gaussian_log_prob, tanh_gaussian
+from beliefrl.models.optimisation import Optimisers, OptimiserState, soft_update, step_all, valid_mean
 from beliefrl.models.returns import lambda_returns
-from beliefrl.models.soft_actor_critic import (
-    LOG_SIGMA_MAX,
-    LOG_SIGMA_MIN,
-    Optimisers,
-    OptimiserState,
-    alpha_loss,
-    q_outputs,
-    soft_update,
-    step_all,
-    valid_mean,
-    wanted_entropy,
-)
+from beliefrl.models.soft_actor_critic import LOG_SIGMA_MAX, LOG_SIGMA_MIN, alpha_loss, q_outputs, wanted_entropy
 from beliefrl.types import Timestep
 
 UNIT_RATE = 1e-3  # smallest weight of a new batch in u², reached after 1 / rate batches

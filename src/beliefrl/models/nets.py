@@ -1,7 +1,7 @@
-"""Building blocks of all networks: perceptrons, the LSTM, Gaussians with and without a tanh, running statistics.
+"""Building blocks of all networks: perceptrons, the LSTM, Gaussians with and without a tanh.
 
 The perceptrons, `LSTM.step` and `tanh_gaussian` are written for one example, and the caller maps them over batches.
-`LSTM.unroll` and `update_statistics` take a batch. The other functions of Gaussians take arrays of any shape.
+`LSTM.unroll` takes a batch. The other functions of Gaussians take arrays of any shape.
 
 The initialisation is PyTorch's: weights and biases are uniform in ±1/√fan_in, those of an LSTM in ±1/√size. A new
 module contains these bounds; `draw` replaces them by random weights.
@@ -9,14 +9,12 @@ module contains these bounds; `draw` replaces them by random weights.
 
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.models.recurrence import Cell, unroll
@@ -217,72 +215,3 @@ def tanh_gaussian(
     action = jnp.tanh(mean + sigma * noise)
     log_prob = -0.5 * (noise**2 + LOG_2PI) - log_sigma - jnp.log(1 - action**2 + TANH_EPSILON)
     return action, jnp.sum(log_prob)
-
-
-def falling_rate(first: float, updates: int, least: float) -> optax.Schedule:
-    """A learning rate that is `first` for a number of updates, and then first · updates / n, but at least `least`.
-
-    If `least` is larger than `first`, the rate is constant.
-    """
-
-    def rate(n: ArrayLike) -> Float[Array, ""]:
-        return jnp.maximum(first * updates / jnp.maximum(n, updates), min(first, least))
-
-    return rate
-
-
-def descend(
-    optimiser: optax.GradientTransformation, gradient: Params, state: optax.OptState, params: Params
-) -> tuple[Params, optax.OptState]:
-    """One step of an optimiser; returns the new parameters and its new state."""
-    tree: Any = params  # optax's types accept only its own trees
-    updates, state = optimiser.update(gradient, state, tree)  # pyright: ignore[reportArgumentType]
-    return optax.apply_updates(tree, updates), state  # pyright: ignore[reportReturnType]
-
-
-class RunningStatistics(NamedTuple):
-    """Running mean and variance of each entry of a vector."""
-
-    mean: Float[Array, " size"]
-    variance: Float[Array, " size"]
-    batches: Float[Array, ""]  # batches so far
-
-
-STATISTICS_RATE = 1e-3  # smallest weight of a new batch, reached after 1 / rate batches
-DEVIATION_MIN = 1e-3  # added to deviations: entries that vary less than this stay small
-STANDARDISED_MAX = 10.0
-
-
-def initial_statistics(size: int) -> RunningStatistics:
-    """The statistics before any batch: mean 0, variance 1."""
-    return RunningStatistics(jnp.zeros(size), jnp.ones(size), jnp.zeros(()))
-
-
-def update_statistics(
-    statistics: RunningStatistics, x: Float[Array, "*batch size"], valid: Bool[Array, "*batch"]
-) -> RunningStatistics:
-    """Include the valid vectors of one more batch. Without valid vectors nothing changes.
-
-    This is an average over batches, and an exponential average after 1 / STATISTICS_RATE batches.
-    """
-    some = jnp.any(valid)
-    batches = statistics.batches + some
-    rate = jnp.where(some, jnp.maximum(1 / jnp.maximum(batches, 1), STATISTICS_RATE), 0.0)
-    flat, weight = x.reshape(-1, x.shape[-1]), valid.ravel()
-    weight = weight / jnp.maximum(jnp.sum(weight), 1)
-    mean = statistics.mean + rate * (weight @ flat - statistics.mean)
-    variance = statistics.variance + rate * (weight @ (flat - mean[None]) ** 2 - statistics.variance)
-    return RunningStatistics(mean, variance, batches)
-
-
-def deviations(variance: Float[Array, " size"]) -> Float[Array, " size"]:
-    """The numbers by which `standardise` divides: standard deviations, plus a small number."""
-    return jnp.sqrt(variance) + DEVIATION_MIN
-
-
-def standardise(statistics: RunningStatistics | None, x: Float[Array, "*batch size"]) -> Float[Array, "*batch size"]:
-    """x with mean 0 and standard deviation 1, clipped to [-10, 10]; x itself if `statistics` is None."""
-    if statistics is None:
-        return x
-    mean, deviation = (jnp.broadcast_to(v, x.shape) for v in (statistics.mean, deviations(statistics.variance)))
-    return jnp.clip((x - mean) / deviation, -STANDARDISED_MAX, STANDARDISED_MAX)

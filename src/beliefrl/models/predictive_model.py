@@ -5,7 +5,7 @@ of unusual rewards. Each has entries for its time constants T, in the units of t
 
     n_t                  = (1 - 1/T) n_{t-1} + o_t,  o_t at the first timestep of an episode
     m_t                  = (1 - 1/T) m_{t-1} + u(r_{t-1}),  zero at the first timestep of an episode
-    u(r)                 = r - r̄ where |r - r̄| > 5 δ,  0 elsewhere
+    u(r)                 = r - r̄ where |r - r̄| > 5 δ,  0 elsewhere (`scales.Usual`)
     h_t                  = LSTM(h_{t-1}; [x_t, m_t / σ_r])
     prediction           = MLP[h_t, a_t]
     J_model              = E ‖prediction - (o_{t+1}, r_t)‖²,  mean over the entries
@@ -22,6 +22,9 @@ They do not change afterwards, so m_t has one meaning in the whole replay. m_t h
 all rewards are equal, m_t would only tell the time. If they vary at every step, m_t might only identify the episode.
 But where a better policy has other rewards at most steps than the exploration had, they all count as unusual. Then m_t
 / σ_r can stay at its limit, and tells nothing.
+
+h_t is the LSTM's state after x_0, ..., x_t. Where o_{t+1} and r_t are not observed, the LSTM reads their prediction
+instead (`forecast`).
 """
 
 from typing import NamedTuple
@@ -31,10 +34,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.models.nets import LSTM, MLP, draw
-from beliefrl.models.soft_actor_critic import valid_mean
-
-UNUSUAL = 5  # mean absolute deviations from the median at which a reward is unusual
+from beliefrl.models.double_q import Policy
+from beliefrl.models.nets import LSTM, MLP, Gaussian, LSTMState, draw
+from beliefrl.models.optimisation import valid_mean
+from beliefrl.models.scales import Scales
+from beliefrl.types import Timestep
 
 
 class PredictiveModel(eqx.Module):
@@ -51,37 +55,6 @@ class PredictiveModel(eqx.Module):
     def predict(self, d: Float[Array, " d"], action: Float[Array, " action"]) -> Float[Array, " prediction"]:
         """(o_{t+1}, r_t) in standardised units, given h_t and a_t."""
         return self.predictor(jnp.concatenate([d, action]))
-
-
-class Usual(NamedTuple):
-    """Which rewards are usual; the first two numbers are averages over the batches of the pre-training."""
-
-    reward: Float[Array, ""]  # r̄, the median of a batch
-    deviation: Float[Array, ""]  # δ, the mean distance to it
-    batches: Float[Array, ""]  # so far; without any, all rewards are usual
-
-    def include(self, reward: Float[Array, "*batch"], valid: Bool[Array, "*batch"]) -> "Usual":
-        """With the valid rewards of one more batch."""
-        batches = self.batches + jnp.any(valid)
-        rate = jnp.any(valid) / jnp.maximum(batches, 1)
-        median = jnp.nan_to_num(jnp.nanmedian(jnp.where(valid, reward, jnp.nan)))
-        deviation = valid_mean(jnp.abs(reward - median), valid)
-        usual = self.reward + rate * (median - self.reward), self.deviation + rate * (deviation - self.deviation)
-        return Usual(*usual, batches)
-
-    def excess(self, reward: Float[Array, ""]) -> Float[Array, ""]:
-        """u(r)."""
-        difference = reward - self.reward
-        is_unusual = (self.batches > 0) & (jnp.abs(difference) > UNUSUAL * self.deviation)
-        return jnp.where(is_unusual, difference, 0.0)
-
-
-def remember(
-    before: Float[Array, "*entry constants"], new: Float[Array, "*entry"], constants: tuple[float, ...]
-) -> Float[Array, "*entry constants"]:
-    """m_t or n_t, given that of the timestep before, u(r_{t-1}) or o_t, and the time constants in steps."""
-    kept = jnp.broadcast_to(1 - 1 / jnp.array(constants), before.shape)
-    return kept * before + new[..., None]
 
 
 def init_model(
@@ -105,11 +78,99 @@ def init_model(
 
 def prediction_loss(
     model: PredictiveModel,
-    d: Float[Array, "time batch d"],
-    action: Float[Array, "length batch action"],
+    start: LSTMState,
+    inputs: Float[Array, "time batch input"],
+    step: Timestep,
     target: Float[Array, "length batch prediction"],
     valid: Bool[Array, "length batch"],
-) -> Float[Array, ""]:
-    """J_model of the transitions that begin at all timesteps but the last; mean over the valid ones."""
-    predicted = jax.vmap(jax.vmap(model.predict))(d[:-1], action)
-    return valid_mean(jnp.mean((predicted - target) ** 2, axis=-1), valid)
+) -> tuple[Float[Array, ""], LSTMState]:
+    """J_model of the valid transitions between length + 1 timesteps; also returns the states, leaves (time, batch, d).
+
+    Args:
+        model: the weights.
+        start: the state before the first timestep, leaves (batch, d).
+        inputs, step: what the LSTM reads at the timesteps, and the timesteps.
+        target: (o_{t+1}, r_t) of each transition, standardised.
+        valid: which pairs of neighbours are transitions.
+    """
+    lstm = model.lstm.unroll(start, inputs, step.is_first)
+    predicted = jax.vmap(jax.vmap(model.predict))(lstm.d[:-1], step.prev_action[1:])
+    return valid_mean(jnp.mean((predicted - target) ** 2, axis=-1), valid), lstm
+
+
+class Perceived(NamedTuple):
+    """What the LSTM reads besides o_t and a_{t-1}."""
+
+    reward: bool  # r_{t-1}
+    reward_memory: tuple[float, ...]  # the time constants of m_t, in steps
+    observation_memory: tuple[float, ...]  # those of n_t
+
+
+class Note(NamedTuple):
+    """What the replay stores with a timestep.
+
+    After the pre-training all notes are made anew: for the exploration b is the untrained policy on the new beliefs.
+    """
+
+    rewards: Float[Array, "*batch constants"]  # m_t, in units of the reward
+    policy: Policy  # b, which chose a_t
+    observations: Float[Array, "*batch obs constants"] | None  # n_t, in units of the observation
+
+
+class Memory(NamedTuple):
+    """The recurrent state of an actor."""
+
+    lstm: LSTMState
+    note: Note  # on the last timestep
+
+    @classmethod
+    def empty(cls, d: int, obs: int, action: int, perceived: Perceived) -> "Memory":
+        """The memory before an episode, given the sizes of the LSTM's state, the observation and the action."""
+        observations = jnp.zeros((obs, len(perceived.observation_memory))) if perceived.observation_memory else None
+        note = Note(jnp.zeros(len(perceived.reward_memory)), Policy(*jnp.zeros((2, action))), observations)
+        return cls(LSTMState.empty(d), note)
+
+
+def remember(
+    before: Float[Array, "*entry constants"], new: Float[Array, "*entry"], constants: tuple[float, ...]
+) -> Float[Array, "*entry constants"]:
+    """m_t or n_t, given that of the timestep before, u(r_{t-1}) or o_t, and the time constants in steps."""
+    kept = jnp.broadcast_to(1 - 1 / jnp.array(constants), before.shape)
+    return kept * before + new[..., None]
+
+
+def perceive(
+    model: PredictiveModel, scales: Scales, before: Memory, step: Timestep, perceived: Perceived
+) -> tuple[Memory, Float[Array, " x"]]:
+    """The memory after one more timestep, and x_t. The policy in its note is still the last one; `act` replaces it."""
+    excess = jnp.where(step.is_first, 0.0, scales.usual.excess(step.reward))
+    rewards = remember(before.note.rewards, excess, perceived.reward_memory)
+    observations = before.note.observations
+    if observations is not None:
+        observations = remember(observations, step.obs, perceived.observation_memory)
+    x = scales.perception(step, observations, perceived.reward)
+    lstm = model.lstm.step(before.lstm, scales.model_input(x, rewards), step.is_first)
+    return Memory(lstm, before.note._replace(rewards=rewards, observations=observations)), x
+
+
+def forecast(
+    model: PredictiveModel, scales: Scales, steps: Timestep, observed: Bool[Array, " time"], perceived: Perceived
+) -> Gaussian:
+    """Predictions of (o_t, r_{t-1}) along one episode from its first timestep on, in the units of the task.
+
+    The leaves are (time, prediction). Each is made one step ahead, from h_{t-1} and a_{t-1}, so the first timestep has
+    none: its entries are NaN. The first timestep must be observed. σ is 0, because the model is deterministic.
+    """
+
+    def advance(carry: tuple[Memory, Array], given: tuple) -> tuple[tuple[Memory, Array], Array]:
+        (memory, predicted), (step, seen, action) = carry, given
+        obs, reward = jnp.where(seen, step.obs, predicted[:-1]), jnp.where(seen, step.reward, predicted[-1])
+        memory, _ = perceive(model, scales, memory, step._replace(obs=obs, reward=reward), perceived)
+        after = scales.in_units(model.predict(memory.lstm.d, action))
+        return (memory, after), predicted
+
+    action = jnp.roll(steps.prev_action, -1, axis=0)  # a_t; the last one is not used
+    obs = steps.obs.shape[-1]
+    start = Memory.empty(model.lstm.w_d.shape[0], obs, action.shape[-1], perceived), jnp.full(obs + 1, jnp.nan)
+    mean = jax.lax.scan(advance, start, (steps, observed, action))[1]
+    return Gaussian(mean, jnp.zeros_like(mean))

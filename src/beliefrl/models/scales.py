@@ -1,14 +1,87 @@
-"""The running statistics by which `predictive-sac` standardises what it perceives and its belief."""
+"""Running statistics by which agents standardise what they perceive and their beliefs.
+
+`Scales` are all those of `predictive-sac`, `Usual` the usual size of its rewards.
+"""
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from beliefrl.models.nets import RunningStatistics, deviations, initial_statistics, standardise, update_statistics
-from beliefrl.models.predictive_model import Usual
+from beliefrl.models.optimisation import valid_mean
 from beliefrl.types import Timestep, Window
+
+STATISTICS_RATE = 1e-3  # smallest weight of a new batch, reached after 1 / rate batches
+DEVIATION_MIN = 1e-3  # added to deviations: entries that vary less than this stay small
+STANDARDISED_MAX = 10.0
+UNUSUAL = 5  # mean absolute deviations from the median at which a reward is unusual
+
+
+class RunningStatistics(NamedTuple):
+    """Running mean and variance of each entry of a vector."""
+
+    mean: Float[Array, " size"]
+    variance: Float[Array, " size"]
+    batches: Float[Array, ""]  # batches so far
+
+
+def initial_statistics(size: int) -> RunningStatistics:
+    """The statistics before any batch: mean 0, variance 1."""
+    return RunningStatistics(jnp.zeros(size), jnp.ones(size), jnp.zeros(()))
+
+
+def update_statistics(
+    statistics: RunningStatistics, x: Float[Array, "*batch size"], valid: Bool[Array, "*batch"]
+) -> RunningStatistics:
+    """Include the valid vectors of one more batch. Without valid vectors nothing changes.
+
+    This is an average over batches, and an exponential average after 1 / STATISTICS_RATE batches.
+    """
+    some = jnp.any(valid)
+    batches = statistics.batches + some
+    rate = jnp.where(some, jnp.maximum(1 / jnp.maximum(batches, 1), STATISTICS_RATE), 0.0)
+    flat, weight = x.reshape(-1, x.shape[-1]), valid.ravel()
+    weight = weight / jnp.maximum(jnp.sum(weight), 1)
+    mean = statistics.mean + rate * (weight @ flat - statistics.mean)
+    variance = statistics.variance + rate * (weight @ (flat - mean[None]) ** 2 - statistics.variance)
+    return RunningStatistics(mean, variance, batches)
+
+
+def deviations(variance: Float[Array, " size"]) -> Float[Array, " size"]:
+    """The numbers by which `standardise` divides: standard deviations, plus a small number."""
+    return jnp.sqrt(variance) + DEVIATION_MIN
+
+
+def standardise(statistics: RunningStatistics | None, x: Float[Array, "*batch size"]) -> Float[Array, "*batch size"]:
+    """x with mean 0 and standard deviation 1, clipped to [-10, 10]; x itself if `statistics` is None."""
+    if statistics is None:
+        return x
+    mean, deviation = (jnp.broadcast_to(v, x.shape) for v in (statistics.mean, deviations(statistics.variance)))
+    return jnp.clip((x - mean) / deviation, -STANDARDISED_MAX, STANDARDISED_MAX)
+
+
+class Usual(NamedTuple):
+    """Which rewards are usual; the first two numbers are averages over the batches of the pre-training."""
+
+    reward: Float[Array, ""]  # r̄, the median of a batch
+    deviation: Float[Array, ""]  # δ, the mean distance to it
+    batches: Float[Array, ""]  # so far; without any, all rewards are usual
+
+    def include(self, reward: Float[Array, "*batch"], valid: Bool[Array, "*batch"]) -> "Usual":
+        """With the valid rewards of one more batch."""
+        batches = self.batches + jnp.any(valid)
+        rate = jnp.any(valid) / jnp.maximum(batches, 1)
+        median = jnp.nan_to_num(jnp.nanmedian(jnp.where(valid, reward, jnp.nan)))
+        deviation = valid_mean(jnp.abs(reward - median), valid)
+        usual = self.reward + rate * (median - self.reward), self.deviation + rate * (deviation - self.deviation)
+        return Usual(*usual, batches)
+
+    def excess(self, reward: Float[Array, ""]) -> Float[Array, ""]:
+        """u(r)."""
+        difference = reward - self.reward
+        is_unusual = (self.batches > 0) & (jnp.abs(difference) > UNUSUAL * self.deviation)
+        return jnp.where(is_unusual, difference, 0.0)
 
 
 class Scales(NamedTuple):

@@ -12,20 +12,17 @@ regularised, and J_α is written in log α and not in α. The gradient has the s
 termination. In each loss the differentiated argument comes first, and means are over valid transitions.
 """
 
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.models.nets import MLP, descend, draw, tanh_gaussian
+from beliefrl.models.nets import MLP, draw, tanh_gaussian
+from beliefrl.models.optimisation import Optimisers, OptimiserState, soft_update, step_all, valid_mean
 
 LOG_SIGMA_MIN, LOG_SIGMA_MAX = -20.0, 2.0
-
-
-Network = TypeVar("Network")
 
 
 class Actor(eqx.Module):
@@ -84,24 +81,24 @@ class Controller(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """Transitions for one update."""
+    """Transitions; the losses take one axis `batch`."""
 
-    belief: Float[Array, "batch belief"]  # s_t
-    next_belief: Float[Array, "batch belief"]  # s_{t+1}; s_{t+m} with returns of m steps (`returns`)
-    action: Float[Array, "batch action"]  # a_t
-    reward: Float[Array, " batch"]  # r_t, or the discounted sum of m of them
-    terminated: Bool[Array, " batch"]  # `next_belief` is terminal
-    discount: Float[Array, " batch"]  # γ^m of the value at `next_belief`
-    valid: Bool[Array, " batch"]  # mask: False entries are ignored
-    actor_input: Float[Array, "batch actor_input"] | None = None  # the actor's input if it is not s_t (SLAC)
+    belief: Float[Array, "*batch belief"]  # s_t
+    next_belief: Float[Array, "*batch belief"]  # s_{t+1}; s_{t+m} with returns of m steps (`returns`)
+    action: Float[Array, "*batch action"]  # a_t
+    reward: Float[Array, "*batch"]  # r_t, or the discounted sum of m of them
+    terminated: Bool[Array, "*batch"]  # `next_belief` is terminal
+    discount: Float[Array, "*batch"]  # γ^m of the value at `next_belief`
+    valid: Bool[Array, "*batch"]  # mask: False entries are ignored
+    actor_input: Float[Array, "*batch actor_input"] | None = None  # the actor's input if it is not s_t (SLAC)
 
 
 def init_controller(
+    key: Key[Array, ""],
     belief: int,
     action: int,
     policy_layers: tuple[int, ...],
     value_layers: tuple[int, ...],
-    key: Key[Array, ""],
     actor_size: int | None = None,
     value_start: float = 0.0,
 ) -> Controller:
@@ -119,12 +116,6 @@ def init_controller(
 
 def _last_biases(controller: Controller) -> list[Any]:
     return [network.layers[-1].bias for network in (*controller.critics, controller.value)]
-
-
-def valid_mean(x: Float[Array, "*batch"], valid: Bool[Array, "*batch"]) -> Float[Array, ""]:
-    """The mean of the valid entries; 0 where none is valid."""
-    x, valid = x.ravel(), valid.ravel()  # a sum over several axes would be rounded differently
-    return jnp.sum(jnp.where(valid, x, 0.0)) / jnp.maximum(jnp.sum(valid), 1)
 
 
 def value_loss(
@@ -195,39 +186,6 @@ def loss(
         "q": valid_mean(q, batch.valid),
     }
     return j_pi + j_v + j_q + j_alpha, metrics
-
-
-def soft_update(target: Network, value: Network, tau: float | Float[Array, ""]) -> Network:
-    """Move a target network, such as V̄, or an average of weights by the fraction τ towards the trained network."""
-    return jax.tree.map(lambda old, new: old + tau * (new - old), target, value)
-
-
-class Optimisers(NamedTuple):
-    """Adam for each group that has a learning rate of its own in Table 1."""
-
-    actor: optax.GradientTransformation
-    critic: optax.GradientTransformation  # Q_1, Q_2, and V if there is one
-    alpha: optax.GradientTransformation
-
-
-class OptimiserState(NamedTuple):
-    actor: optax.OptState
-    critic: optax.OptState
-    alpha: optax.OptState
-
-
-def init_optimisers(optimisers: Optimisers, trained: tuple[Any, ...]) -> OptimiserState:
-    """Fresh states for the parameters of each optimiser."""
-    return OptimiserState(*(optimiser.init(each) for optimiser, each in zip(optimisers, trained, strict=True)))
-
-
-def step_all(
-    optimisers: Optimisers, state: OptimiserState, trained: tuple[Any, ...], gradient: tuple[Any, ...]
-) -> tuple[tuple[Any, ...], OptimiserState]:
-    """One step of every optimiser; returns the new parameters of each and the new states."""
-    steps = [descend(*each) for each in zip(optimisers, gradient, state, trained, strict=True)]
-    after, states = zip(*steps, strict=True)
-    return after, OptimiserState(*states)
 
 
 def update(

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from beliefrl.models.nets import LSTMState
-from beliefrl.models.soft_actor_critic import valid_mean
+from beliefrl.models.optimisation import valid_mean
 from beliefrl.models.variational_model import VRM, elbo_terms, prediction_error
 from beliefrl.types import Window, perception
 
