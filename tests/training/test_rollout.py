@@ -91,12 +91,13 @@ def test_an_addition_is_masked_only_where_asked():
     assert int(jax.jit(ring.add)(empty(8), timestep(1, False)).added) == 1
 
 
-def test_starts_are_uniform():
-    shape, count = WindowShape(2, 4), 30
+@pytest.mark.parametrize("least", [None, 1])
+def test_starts_are_uniform(least):
+    shape, count = WindowShape(2, 4, least=least), 30
     window = sample(filled(64, np.zeros(count, bool)), jax.random.key(2), 20_000, shape)
     starts = np.array(window.note[0])[shape.burn_in].astype(int)
     drawn = np.bincount(starts, minlength=count)
-    possible = count - shape.length
+    possible = count - (least or shape.length)
     assert set(np.flatnonzero(drawn)) == set(range(possible))
     assert np.abs(drawn[:possible] / drawn.sum() * possible - 1).max() < 0.2
 

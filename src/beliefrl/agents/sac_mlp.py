@@ -48,7 +48,7 @@ class SACMLPAgent(SACAgent):
     @property
     def window(self) -> WindowShape:
         """n + 1 timesteps. Two of them are no transition, and are masked, if an episode ends between them."""
-        return WindowShape(burn_in=0, length=self.n_step)
+        return WindowShape(burn_in=0, length=self.n_step, least=1)  # only the first transition is learned
 
     @property
     def pretrain_windows(self) -> int:

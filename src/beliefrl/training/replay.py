@@ -126,12 +126,12 @@ def renumbered(readers: Readers, missing: Int[Array, "*rings"]) -> Readers:
 def sample(replay: Replay, key: Key[Array, ""], batch: int, shape: WindowShape) -> Window:
     """Draw `batch` windows of burn_in + length + 1 timesteps, leaves (time, batch, ...).
 
-    The first transition after the burn-in is uniform over all starts whose `length` transitions are stored, so
-    every stored transition can be drawn. The burn-in overhangs where too little lies before it; with fewer timesteps
-    than a window needs the rest overhangs as well. What overhangs is marked in `exists`. With several rings, the start
-    is uniform over those of all rings.
+    The first transition after the burn-in is uniform over all starts whose `length` transitions (or `least`) are
+    stored, so every stored transition can be drawn. The burn-in overhangs where too little lies before it; with fewer
+    timesteps than a window needs the rest overhangs as well. What overhangs is marked in `exists`. With several rings,
+    the start is uniform over those of all rings.
     """
-    start, ring = places(replay, key, batch, shape.length)
+    start, ring = places(replay, key, batch, shape.length if shape.least is None else shape.least)
     oldest, added = (bound[None] for bound in span(replay, ring))
     numbers = start[None] + jnp.arange(-shape.burn_in, shape.length + 1)[:, None]
     timesteps = gather(replay, numbers, ring[None])
