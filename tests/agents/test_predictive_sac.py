@@ -355,8 +355,8 @@ def test_traces_use_the_policy_noted_at_their_timestep(state, begun):
     belief = jax.jit(agent.learn_model)(state, window)[1]
     valid, key = jnp.ones((6, 2), bool), jax.random.split(key)[0]
     given = standardise(after.scales.belief, belief), window.step, valid, policy, key
-    settings = {"gamma": agent.gamma, "decay": 0.8, "off_policy": 0.0, "pessimism": 0.25}
-    y, _ = jax.jit(lambda: double_q.critic_targets(state.controller, *given, **settings))()
+    traces = double_q.Traces(agent.gamma, decay=0.8, off_policy=0.0)
+    y, _ = jax.jit(lambda: double_q.critic_targets(state.controller, *given, traces, 0.25))()
     np.testing.assert_allclose(after.pool.transitions.target[0], y.ravel(), rtol=1e-4, atol=1e-5)
 
 

@@ -239,8 +239,8 @@ def test_targets_mix_the_values_of_the_target_networks_by_how_likely_the_actions
     step = Timestep(belief, jax.random.normal(keys[2], (time, 2)), action, first, terminated)
     behaviour = Policy(*(0.5 * jax.random.normal(key, (time, 2, ACTION)) for key in keys[3:]))
     valid = jnp.ones((time - 1, 2), bool)
-    settings = {"gamma": 0.9, "decay": 0.8, "off_policy": 0.25, "pessimism": pessimism}
-    made = jax.jit(lambda: double_q.critic_targets(controller, belief, step, valid, behaviour, key, **settings))
+    settings = double_q.Traces(0.9, decay=0.8, off_policy=0.25), pessimism
+    made = jax.jit(lambda: double_q.critic_targets(controller, belief, step, valid, behaviour, key, *settings))
     y, like = map(np.asarray, made())
 
     flat = np.asarray(belief).reshape(-1, BELIEF)

@@ -264,23 +264,21 @@ class PredictiveSACAgent(ControllerAgent):
         """One update of the model; then a batch from the pool for each update of the controller."""
         key_targets, key_draw = jax.random.split(key)
         state, belief, metrics = self.learn_model(state, windows)
-        valid = reading.known_transitions(windows)
-        y, likeness = double_q.critic_targets(
-            state.controller,
-            standardise(state.scales.belief, belief),
-            windows.step,
-            valid,
-            windows.note.policy,
-            key_targets,
-            gamma=self.gamma,
-            decay=self.trace_decay,
-            off_policy=self.off_policy_trace,
-            pessimism=self.pessimism,
-        )
-        pool = state.pool.add(Samples(belief[:-1], windows.step.prev_action[1:], y, valid))
+        samples, likeness = self.samples(state, windows, belief, key_targets)
+        pool = state.pool.add(samples)
         batches = pool.draw(key_draw, (self.cycle * self.updates_per_step, self.batch_size))
         batches = batches._replace(belief=standardise(state.scales.belief, batches.belief))
-        return state._replace(pool=pool), batches, metrics | {"likeness": valid_mean(likeness, valid)}
+        return state._replace(pool=pool), batches, metrics | {"likeness": likeness}
+
+    def samples(
+        self, state: State, windows: Window, belief: Float[Array, "time batch belief"], key: Key[Array, ""]
+    ) -> tuple[Samples, Float[Array, ""]]:
+        """The transitions of windows with their targets; also the mean of min(1, π / b)."""
+        valid, s = reading.known_transitions(windows), standardise(state.scales.belief, belief)
+        traces = double_q.Traces(self.gamma, self.trace_decay, self.off_policy_trace)
+        step, b = windows.step, windows.note.policy
+        y, likeness = double_q.critic_targets(state.controller, s, step, valid, b, key, traces, self.pessimism)
+        return Samples(belief[:-1], step.prev_action[1:], y, valid), valid_mean(likeness, valid)
 
     def update(self, state: State, batch: Samples, key: Key[Array, ""]) -> tuple[State, Metrics]:
         controller, optimiser, metrics = double_q.update(

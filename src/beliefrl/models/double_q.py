@@ -155,6 +155,14 @@ def likeness(policy: Policy, behaviour: Policy, action: Float[Array, "*batch act
     return jnp.exp(jnp.minimum(jnp.sum(pi - b, axis=-1), 0.0))
 
 
+class Traces(NamedTuple):
+    """How far rewards ahead count in a λ-return."""
+
+    gamma: float  # the discount γ
+    decay: float  # λ
+    off_policy: float  # ω: the trace is ωλ at an action that π would not choose
+
+
 def critic_targets(
     controller: DoubleQController,
     belief: Float[Array, "time batch belief"],
@@ -162,10 +170,7 @@ def critic_targets(
     valid: Bool[Array, "length batch"],
     behaviour: Policy,
     key: Key[Array, ""],
-    *,
-    gamma: float,
-    decay: float,
-    off_policy: float,
+    traces: Traces,
     pessimism: float,
 ) -> tuple[Float[Array, "length batch"], Float[Array, "length batch"]]:
     """y_t of the transitions between length + 1 timesteps, and min(1, π / b) there.
@@ -176,15 +181,16 @@ def critic_targets(
         valid: which pairs of neighbours are transitions. For the others y_t has no meaning.
         behaviour: b(a|s_t) at the timesteps.
         key: the randomness of ã.
-        gamma, decay, off_policy, pessimism: γ, λ, ω and P.
+        traces: γ, λ and ω.
+        pessimism: P.
     """
     flat = belief.reshape(-1, belief.shape[-1])
     action, _, policy = sample(controller.actor, flat, key)
     value = (controller.unit.u * q_low(controller.targets, flat, action, pessimism)).reshape(belief.shape[:2])
     policy = jax.tree.map(lambda leaf: leaf.reshape(*belief.shape[:2], -1)[:-1], policy)
     like = likeness(policy, jax.tree.map(lambda leaf: leaf[:-1], behaviour), step.prev_action[1:])
-    trace = decay * (off_policy + (1 - off_policy) * like)
-    return lambda_returns(step, valid, value, trace, gamma), like
+    trace = traces.decay * (traces.off_policy + (1 - traces.off_policy) * like)
+    return lambda_returns(step, valid, value, trace, traces.gamma), like
 
 
 def rescale(
