@@ -5,7 +5,6 @@ ranges of options are checked by `Options`, and those of hyperparameters by the 
 """
 
 import json
-import os
 import pathlib
 import platform
 import subprocess
@@ -213,7 +212,7 @@ def provenance() -> dict[str, Any]:
         "versions": {"python": platform.python_version()} | {name: metadata.version(name) for name in PACKAGES},
         "device": str(jax.devices()[0].device_kind),
         "git_commit": _git_commit(),
-        "command": [os.path.basename(sys.argv[0]), *sys.argv[1:]],
+        "command": [pathlib.Path(sys.argv[0]).name, *sys.argv[1:]],
         "started": now(),
     }
 
