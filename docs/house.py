@@ -29,7 +29,7 @@ def read() -> Package:
     """The layers that import-linter checks, and the imports between their parts."""
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
     names = next(contract["layers"] for contract in contracts if contract["type"] == "layers")
-    layers = [[name.strip().removeprefix("beliefrl.") for name in line.split("|")] for line in names]
+    layers = [[name.strip() for name in line.split("|")] for line in names]
     graph = grimp.build_graph("beliefrl")
     modules: dict[str, list[str]] = {part: [] for layer in layers for part in layer}
     pairs = set()

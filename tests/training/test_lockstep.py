@@ -206,6 +206,7 @@ def test_the_replay_is_divided_among_the_environments():
 def test_a_slow_step_is_reported_once_while_it_goes_on(monkeypatch, processes):
     lanes = Lockstep(GymnasiumTask(Sleeping, "robot"), ["seed 0"], processes)  # made before the watch: it takes seconds
     monkeypatch.setattr(lockstep, "SLOW", 0.2)
+    monkeypatch.setattr(lockstep, "LOOK_EVERY", 0.01)
     reports = []
     watch = threading.Thread(target=lanes._watch, args=(lambda report: reports.append((time.monotonic(), report)),))
     watch.start()
@@ -343,6 +344,7 @@ def test_a_time_limit_needs_processes(tmp_path):
 @pytest.mark.nightly
 def test_a_training_reports_a_slow_step(monkeypatch, tmp_path):
     monkeypatch.setattr(lockstep, "SLOW", 0.2)
+    monkeypatch.setattr(lockstep, "LOOK_EVERY", 0.01)
     notes = []
     agent = agents.make("sac-mlp", **SHARED, batch_size=8, pretrain_updates=0)
     options = {"steps": 12, "eval_episodes": 1, "processes": "never"}

@@ -6,7 +6,6 @@ ranges of options are checked by `Options`, and those of hyperparameters by the 
 
 import contextlib
 import json
-import os
 import pathlib
 import platform
 import subprocess
@@ -219,7 +218,7 @@ def provenance() -> dict[str, Any]:
         "versions": versions,
         "device": str(jax.devices()[0].device_kind),
         "git_commit": _git_commit(),
-        "command": [os.path.basename(sys.argv[0]), *sys.argv[1:]],
+        "command": [pathlib.Path(sys.argv[0]).name, *sys.argv[1:]],
         "started": now(),
     }
 

@@ -14,13 +14,14 @@ from beliefrl.catalogue import our_task_names as our_names
 from beliefrl.catalogue import task_names as names
 from beliefrl.imports import declared, declared_name, load, load_declared, path
 from beliefrl.tasks import registered
-from beliefrl.tasks.faults import NONE, Faults, faults_of, without_faults
+from beliefrl.tasks.faults import NONE, Faults
 from beliefrl.tasks.gymnasium import GymnasiumTask
-from beliefrl.tasks.observed import Observed
-from beliefrl.tasks.observed import entries as entries
-from beliefrl.tasks.observed import entry_names as entry_names
-from beliefrl.tasks.observed import full as full
-from beliefrl.tasks.variants import as_task, observe, steps_per_action, with_action_repeat, with_faults
+from beliefrl.tasks.variants import Variant, as_task, as_variant, observe, with_action_repeat, with_faults
+from beliefrl.tasks.variants import entries as entries
+from beliefrl.tasks.variants import entry_names as entry_names
+from beliefrl.tasks.variants import full as full
+from beliefrl.tasks.variants import steps_per_action as steps_per_action
+from beliefrl.tasks.variants import without_faults as without_faults
 from beliefrl.types import Spec, UserError, said, short, tuples
 
 
@@ -140,7 +141,7 @@ def _make(name: str, constants: dict[str, Any]) -> Any:
         task = registered.make(robot.id, dict(robot.arguments) | constants, name)
         return task if mask is None else dataclasses.replace(task, indices=getattr(robot, mask))
     task = _built(base, TASKS[base], constants)
-    return task if mask is None else Observed(task, getattr(task, mask.upper()))
+    return task if mask is None else Variant(task, getattr(task, mask.upper()))
 
 
 def _make_declared(name: str, constants: dict[str, Any]) -> Any:
@@ -186,7 +187,7 @@ def _indices(name: str, task: Any, observe: Sequence[int | str] | int | str) -> 
     given = list(observe) if isinstance(observe, Iterable) and not isinstance(observe, str) else [observe]
     if len(given) == 1 and given[0] in MASKS.values():
         known: Any = KNOWN.get(name.removeprefix(PREFIX), ROBOTS.get(name))
-        velocities, positions = masks(known or TASKS.get(name) or task)
+        velocities, positions = masks(known or TASKS.get(name) or with_action_repeat(task, 1))
         if not velocities:
             raise UserError(f"{name} does not define which entries are {given[0]}: give their indices.")
         return velocities if given[0] == "velocities" else positions
@@ -205,24 +206,24 @@ def describe(task: Any) -> dict[str, Any]:
     action repeat is one of the constants. A task that `make` cannot make has the name module:Class and no other
     constants. Nothing is imported.
     """
-    faults, repeat = faults_of(task), steps_per_action(task)
-    if faults != NONE:
-        return describe(without_faults(task)) | {"faults": faults.settings()}
-    if repeat != 1:
-        found = describe(with_action_repeat(task, 1))
-        return found | {"constants": found["constants"] | {"steps_per_action": repeat}}
-    if isinstance(task, GymnasiumTask):
-        return _describe_gymnasium(task)
-    base, indices = (task.task, task.indices) if isinstance(task, Observed) else (task, None)
-    velocities, positions = masks(base)
+    variant = as_variant(task)
+    found = _describe_gymnasium(variant) if isinstance(variant, GymnasiumTask) else _describe_jax(variant)
+    if variant.steps_per_action != 1:
+        found["constants"]["steps_per_action"] = variant.steps_per_action
+    return found if variant.faults == NONE else found | {"faults": variant.faults.settings()}
+
+
+def _describe_jax(variant: Variant) -> dict[str, Any]:
+    task, indices = variant.task, variant.indices
+    velocities, positions = masks(task)
     suffix = {None: "", velocities: "-v", positions: "-p"}.get(indices)
-    name = next((name for name, known in TASKS.items() if type(base) is known), None)
-    name = name or declared_name(GROUP, type(base), our_names())
+    name = next((name for name, known in TASKS.items() if type(task) is known), None)
+    name = name or declared_name(GROUP, type(task), our_names())
     if name is not None and suffix is not None:
-        return {"task": name + suffix, "constants": dataclasses.asdict(base), "observe": None}
-    if isinstance(task, Observed):
-        return describe(task.task) | {"observe": list(task.indices)}
-    return {"task": path(type(task)), "constants": {}, "observe": None}
+        return {"task": name + suffix, "constants": dataclasses.asdict(task), "observe": None}
+    constants = {} if name is None else dataclasses.asdict(task)
+    observe = None if indices is None else list(indices)
+    return {"task": name or path(type(task)), "constants": constants, "observe": observe}
 
 
 def _describe_gymnasium(task: GymnasiumTask) -> dict[str, Any]:

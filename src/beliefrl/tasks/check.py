@@ -120,7 +120,7 @@ def _declared(task: Any) -> TaskCheck:
     """The declarations of a task, and the refusals. If its spaces are not supported: no entries."""
     if not isinstance(task, GymnasiumTask):
         name = tasks.describe(task)["task"]
-        refusals = _refusals(lambda: check_traced(task, name))
+        refusals = _refusals(lambda: check_traced(tasks.full(task), name))
         if refusals:
             return TaskCheck(name, "unknown", "unknown", refusals=refusals)
         spec, names = task.spec, tasks.entry_names(tasks.full(task))

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Key, UInt8
 from beliefrl import tasks
 from beliefrl.tasks import Task
 from beliefrl.tasks.drawing import Picture, Viewer, paint
-from beliefrl.tasks.faults import Faulty
+from beliefrl.tasks.variants import FaultyState
 from beliefrl.types import LARGEST, UserError
 
 # The task is a static argument, so environments of equal tasks share one compiled program.
@@ -109,7 +109,7 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         """
         if not self._states:
             raise UserError("The environment has no state yet: call reset first.")
-        return [state.task for state in self._states] if isinstance(self.task, Faulty) else self._states
+        return [state.task for state in self._states] if isinstance(self._states[0], FaultyState) else self._states
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

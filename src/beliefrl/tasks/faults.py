@@ -5,7 +5,7 @@ At each step, in this order:
     the action that is applied   the agent's action, or the one that was applied before (`sticky`)
     the task's observation       that of `delay` steps ago, plus Gaussian noise, then zeros for lost entries
 
-The equations are in `Faults`, for JAX and for numpy. `Faulty` applies them to JAX tasks, and
+The equations are in `Faults`, for JAX and for numpy. `variants.Variant` applies them to JAX tasks, and
 `seen_environment.FaultyEnvironment` to Gymnasium environments.
 """
 
@@ -14,11 +14,7 @@ import numbers
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Key
-
-from beliefrl.types import LARGEST, Spec, UserError, check_choice, check_range, short, tuples
+from beliefrl.types import LARGEST, UserError, check_choice, check_range, short, tuples
 
 LONGEST_DELAY = 10_000
 STREAM = 1_179_406_420  # separates the random numbers of faults from those of the task, which has the same key
@@ -139,72 +135,3 @@ def _is_deviation(value: Any) -> bool:
 
 
 NONE = Faults()
-
-
-class FaultyState(NamedTuple):
-    """The state of a task, and of its faults."""
-
-    task: Any
-    waiting: Float[Array, "delay obs"]
-    action: Float[Array, " action"]  # the last one that was applied
-
-
-@dataclasses.dataclass(frozen=True)
-class Faulty:
-    """A JAX task with faults. Its true states and rewards are those of the task."""
-
-    task: Any
-    faults: Faults
-
-    def __post_init__(self) -> None:
-        """Raise a UserError if the noise does not fit the observation."""
-        self.faults.observed_size(self.task.spec.obs_dim)
-
-    @property
-    def spec(self) -> Spec:
-        spec = self.task.spec
-        return spec._replace(obs_dim=self.faults.observed_size(spec.obs_dim))
-
-    def reset(self, key: Key[Array, ""]) -> tuple[FaultyState, Float[Array, " obs"]]:
-        state, obs = self.task.reset(key)
-        waiting, seen = self.faults.observe(jnp, self.faults.start(jnp, obs), obs, self._draws(key))
-        return FaultyState(state, waiting, jnp.zeros(self.task.spec.action_dim)), seen
-
-    def step(
-        self, state: FaultyState, action: Float[Array, " action"], key: Key[Array, ""]
-    ) -> tuple[FaultyState, Float[Array, " obs"], Float[Array, ""], Bool[Array, ""]]:
-        draws = self._draws(key)
-        action = self.faults.applied(jnp, action, state.action, draws)
-        inner, obs, reward, terminated = self.task.step(state.task, action, key)
-        waiting, seen = self.faults.observe(jnp, state.waiting, obs, draws)
-        return FaultyState(inner, waiting, action), seen, reward, terminated
-
-    def measures(self, state: FaultyState) -> dict[str, Array]:
-        return self.task.measures(state.task)
-
-    def _draws(self, key: Key[Array, ""]) -> Draws:
-        size = (self.task.spec.obs_dim,)
-        noise, entries, whole, action = jax.random.split(jax.random.fold_in(key, STREAM), 4)
-        return Draws(
-            jax.random.normal(noise, size),
-            jax.random.uniform(entries, size),
-            jax.random.uniform(whole),
-            jax.random.uniform(action),
-        )
-
-
-def faults_of(task: Any) -> Faults:
-    """The faults of a task, by default none."""
-    return NONE if is_bare(task) else task.faults
-
-
-def without_faults(task: Any) -> Any:
-    """The same task without its faults."""
-    if isinstance(task, Faulty):
-        return task.task
-    return task if is_bare(task) else dataclasses.replace(task, faults=NONE)
-
-
-def is_bare(task: Any) -> bool:
-    """Whether a task has no field for faults: it is neither a Faulty nor a GymnasiumTask."""
-    return not isinstance(getattr(task, "faults", None), Faults)

@@ -2,15 +2,114 @@
 
 import dataclasses
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.tasks.faults import NONE, Faults, Faulty, faults_of, is_bare
+from beliefrl.tasks.faults import NONE, STREAM, Draws, Faults
 from beliefrl.tasks.gymnasium import GymnasiumTask
-from beliefrl.tasks.observed import Observed
-from beliefrl.tasks.repeat import LONGEST, Repeated
-from beliefrl.types import UserError, check_indices, check_whole, short
+from beliefrl.tasks.repeat import LONGEST, actions, repeated_step
+from beliefrl.types import Spec, UserError, check_indices, check_whole, short
+
+
+class FaultyState(NamedTuple):
+    """The state of a task, and of its faults."""
+
+    task: Any
+    waiting: Float[Array, "delay obs"]
+    action: Float[Array, " action"]  # the last one that was applied
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """A JAX task as the agent sees it, with the same fields as a GymnasiumTask. Its true states are those of the task.
+
+    Actions are repeated first, then entries are selected, and faults apply to these.
+    """
+
+    task: Any
+    indices: tuple[int, ...] | None = None
+    """Entries of the observation that the agent sees (Appendix B: velocities only, no velocities); None: all."""
+    faults: Faults = NONE
+    """Missing and faulty sensors."""
+    steps_per_action: int = 1
+    """Steps of the task for which an action is applied. For the agent they are one step."""
+
+    def __post_init__(self) -> None:
+        """Raise a UserError if the indices or the noise do not fit the observation."""
+        if self.indices is not None:
+            check_indices(self.indices, self.task.spec.obs_dim)
+        self.faults.observed_size(self._size)
+
+    @property
+    def _size(self) -> int:
+        return self.task.spec.obs_dim if self.indices is None else len(self.indices)
+
+    @property
+    def spec(self) -> Spec:
+        """As of the task. The time limit is rounded up to whole actions."""
+        spec, size = self.task.spec, self.faults.observed_size(self._size)
+        return spec._replace(obs_dim=size, max_steps=actions(spec.max_steps, self.steps_per_action))
+
+    @property
+    def entry_names(self) -> tuple[str, ...]:
+        """The name of each entry that the agent sees.
+
+        Raises:
+            UserError: the number of the task's names differs from the number of its entries.
+        """
+        size = self.task.spec.obs_dim
+        names = getattr(self.task, "entry_names", None) or [f"entry {i}" for i in range(size)]
+        if len(names) != size:
+            raise UserError(
+                f"{type(self.task).__name__} has {len(names)} entry_names for an observation of {size}: give one name "
+                "for each entry."
+            )
+        return tuple(names if self.indices is None else (names[i] for i in self.indices))
+
+    def reset(self, key: Key[Array, ""]) -> tuple[Any, Float[Array, " obs"]]:
+        state, obs = self.task.reset(key)
+        obs = self._selected(obs)
+        if self.faults == NONE:
+            return state, obs
+        waiting, seen = self.faults.observe(jnp, self.faults.start(jnp, obs), obs, self._draws(key))
+        return FaultyState(state, waiting, jnp.zeros(self.task.spec.action_dim)), seen
+
+    def step(
+        self, state: Any, action: Float[Array, " action"], key: Key[Array, ""]
+    ) -> tuple[Any, Float[Array, " obs"], Float[Array, ""], Bool[Array, ""]]:
+        if self.faults == NONE:
+            return self._true_step(state, action, key)
+        draws = self._draws(key)
+        action = self.faults.applied(jnp, action, state.action, draws)
+        inner, obs, reward, terminated = self._true_step(state.task, action, key)
+        waiting, seen = self.faults.observe(jnp, state.waiting, obs, draws)
+        return FaultyState(inner, waiting, action), seen, reward, terminated
+
+    def measures(self, state: Any) -> dict[str, Array]:
+        return self.task.measures(state if self.faults == NONE else state.task)
+
+    def _true_step(
+        self, state: Any, action: Float[Array, " action"], key: Key[Array, ""]
+    ) -> tuple[Any, Float[Array, " obs"], Float[Array, ""], Bool[Array, ""]]:
+        """A step without faults."""
+        state, obs, reward, terminated = repeated_step(self.task, state, action, key, self.steps_per_action)
+        return state, self._selected(obs), reward, terminated
+
+    def _selected(self, obs: Float[Array, " full"]) -> Float[Array, " seen"]:
+        return obs if self.indices is None else obs[jnp.array(self.indices)]
+
+    def _draws(self, key: Key[Array, ""]) -> Draws:
+        noise, entries, whole, action = jax.random.split(jax.random.fold_in(key, STREAM), 4)
+        return Draws(
+            jax.random.normal(noise, (self._size,)),
+            jax.random.uniform(entries, (self._size,)),
+            jax.random.uniform(whole),
+            jax.random.uniform(action),
+        )
 
 
 def as_task(task: Any) -> Any:
@@ -48,6 +147,19 @@ def _not_one(environment: Any) -> str:
     )
 
 
+def as_variant(task: Any) -> Variant | GymnasiumTask:
+    """The task with the fields `indices`, `faults` and `steps_per_action`."""
+    return task if isinstance(task, Variant | GymnasiumTask) else Variant(task)
+
+
+def _changed(task: Any, **fields: Any) -> Any:
+    """The same task with other fields; the bare JAX task if it needs none of them."""
+    new = dataclasses.replace(as_variant(task), **fields)
+    if isinstance(new, Variant) and (new.indices, new.faults, new.steps_per_action) == (None, NONE, 1):
+        return new.task
+    return new
+
+
 def observe(task: Any, indices: tuple[int, ...]) -> Any:
     """The same task with only the entries `indices` of its observation.
 
@@ -57,25 +169,16 @@ def observe(task: Any, indices: tuple[int, ...]) -> Any:
         UserError: an index is outside the observation or occurs twice, there is no index, the task has faults, or
             `task` is no task.
     """
-    task = as_task(task)
-    if faults_of(task) != NONE:
+    variant = as_variant(as_task(task))
+    if variant.faults != NONE:
         raise UserError("The task has faults already: select the entries first, then add the faults (with_faults).")
-    if isinstance(task, GymnasiumTask):
-        return _observe_host(task, indices)
-    check_indices(indices, task.spec.obs_dim)
-    if isinstance(task, Observed):  # one selection: `describe` records one
-        return Observed(task.task, tuple(task.indices[i] for i in indices))
-    return Observed(task, tuple(indices))
-
-
-def _observe_host(task: GymnasiumTask, indices: tuple[int, ...]) -> GymnasiumTask:
     if isinstance(indices, str) or not isinstance(indices, Iterable):
         check_indices(indices, 0)  # says what is wrong
-    if task.indices is not None:
-        check_indices(indices, len(task.indices))
-        indices = tuple(task.indices[i] for i in indices)
-    chosen = dataclasses.replace(task, indices=tuple(indices))
-    _ = chosen.spec  # checks them, in the only environment that is made: it may be a robot
+    if variant.indices is not None:
+        check_indices(indices, len(variant.indices))
+        indices = tuple(variant.indices[i] for i in indices)
+    chosen = dataclasses.replace(variant, indices=tuple(indices))
+    _ = chosen.spec  # checks those of an environment, in the only one that is made: it may be a robot
     return chosen
 
 
@@ -91,9 +194,9 @@ def with_faults(task: Any, faults: Faults | Mapping[str, Any] | None) -> Any:
     task, faults = as_task(task), Faults.of(faults)
     if faults == NONE:
         return task
-    if faults_of(task) != NONE:
+    if as_variant(task).faults != NONE:
         raise UserError("The task has faults already: give all faults at once.")
-    return Faulty(task, faults) if is_bare(task) else dataclasses.replace(task, faults=faults)
+    return _changed(task, faults=faults)
 
 
 def with_action_repeat(task: Any, steps_per_action: int) -> Any:
@@ -106,19 +209,40 @@ def with_action_repeat(task: Any, steps_per_action: int) -> Any:
         UserError: `steps_per_action` is not a whole number from 1 to 10,000, or `task` is no task.
     """
     check_whole("steps_per_action", steps_per_action, 1, LONGEST)
-    task, times = as_task(task), int(steps_per_action)
-    if isinstance(task, GymnasiumTask):
-        return dataclasses.replace(task, steps_per_action=times)
-    if isinstance(task, Faulty | Observed):
-        return dataclasses.replace(task, task=with_action_repeat(task.task, times))
-    task = task.task if isinstance(task, Repeated) else task
-    return task if times == 1 else Repeated(task, times)
+    return _changed(as_task(task), steps_per_action=int(steps_per_action))
+
+
+def without_faults(task: Any) -> Any:
+    """The same task without its faults."""
+    return _changed(task, faults=NONE)
+
+
+def full(task: Any) -> Any:
+    """The same task with its full observation and without faults."""
+    return _changed(task, indices=None, faults=NONE)
 
 
 def steps_per_action(task: Any) -> int:
     """The number of the task's steps for which an action is applied."""
-    if isinstance(task, GymnasiumTask):
-        return task.steps_per_action
-    if isinstance(task, Faulty | Observed):
-        return steps_per_action(task.task)
-    return task.times if isinstance(task, Repeated) else 1
+    return as_variant(task).steps_per_action
+
+
+def entries(task: Any) -> tuple[int, ...]:
+    """Indices of the entries that the agent sees in the task's full observation, in the agent's order.
+
+    The flag of `Faults.flicker_flag` has the index after the last one of the full observation.
+    """
+    variant = as_variant(task)
+    if variant.indices is None:
+        return tuple(range(variant.spec.obs_dim))
+    return (*variant.indices, full(task).spec.obs_dim) if variant.faults.flicker_flag else tuple(variant.indices)
+
+
+def entry_names(task: Any) -> tuple[str, ...]:
+    """The label of each entry that the agent sees: the task's name for it, or its index, "entry 2".
+
+    Raises:
+        UserError: the number of names differs from the number of entries.
+    """
+    variant = as_variant(task)
+    return (*variant.entry_names, "lost") if variant.faults.flicker_flag else variant.entry_names

@@ -36,7 +36,7 @@ def possible(options: Options, task: Any, own_process: bool) -> None:
     """
     trackers.check(options.track)
     if not isinstance(task, GymnasiumTask):
-        check_traced(task, tasks.describe(task)["task"])
+        check_traced(tasks.full(task), tasks.describe(task)["task"])
     if options.overlap and not isinstance(task, GymnasiumTask):
         raise UserError(
             "overlap needs a Gymnasium environment: a task in JAX is compiled together with the updates. Leave the "

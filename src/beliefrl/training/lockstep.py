@@ -28,6 +28,7 @@ from beliefrl.types import UserError, said
 
 HANDOVER = 5e-4  # approximate seconds for passing a step to other processes
 SLOW = 60.0  # seconds after which a call that has not returned is reported
+LOOK_EVERY = 1.0  # seconds between two looks for such a call
 RESET = 60.0  # seconds that a reset may take, if steps have a limit
 
 
@@ -194,7 +195,7 @@ class Lockstep:
     def _watch(self, notify: Callable[[str], None]) -> None:
         """Report every call that takes longer than SLOW, once."""
         reported = None
-        while not self._closed.wait(SLOW / 60):
+        while not self._closed.wait(LOOK_EVERY):
             call = self._call
             if call is None or call is reported or time.monotonic() - call.began < SLOW:
                 continue
@@ -242,8 +243,7 @@ def _silence() -> Iterator[None]:
 
 def _pays(task: GymnasiumTask, lanes: int) -> bool:
     """Whether processes of their own are faster, measured with some random steps."""
-    free = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    cores = min(lanes, free)
+    cores = min(lanes, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
     return cores > 1 and lanes * step_seconds(task) * (1 - 1 / cores) > HANDOVER
 
 
