@@ -156,6 +156,9 @@ BOXES = spaces.Dict({"arm": BOX, "imu": BOX})
 FAULTS = {  # environment: (a phrase of the message, the step that it names)
     observing(PAIR, np.array([1, 2]), np.array([2, 0])): ("does not fit its space MultiDiscrete", 3),
     observing(spaces.Discrete(3), 1, -1): ("does not fit its space Discrete", 3),
+    observing(spaces.Discrete(3), 1, np.zeros(2, int)): ("does not fit its space Discrete", 3),
+    observing(spaces.Dict({"a": PAIR}), {"a": [1, 2]}, {"a": [1]}): (" at ['a']", 3),
+    observing(spaces.Dict({"a": spaces.MultiBinary(2)}), {"a": [0, 1]}, {"a": [0, 1, 1]}): (" at ['a']", 3),
     observing(spaces.Dict({"a": spaces.Discrete(3)}), {"a": 1}, {"a": -1}): ("does not fit its space Dict", 3),
     observing(spaces.Tuple([spaces.MultiBinary(2), BOX]), ([0, 1], np.ones(2)), ([5, 7], np.ones(2))): (
         "does not fit its space Tuple",

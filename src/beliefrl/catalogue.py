@@ -119,11 +119,19 @@ def written(path: str) -> dict[str, Any]:
 
 
 @functools.cache
-def usual_constants(task: str) -> dict[str, Any]:
-    """The default constants of one of our JAX tasks, with lists for tuples as in JSON; {} for other tasks."""
+def usual_constants(task: str) -> dict[str, Any] | None:
+    """The default constants of one of our tasks, with lists for tuples as in JSON; None for a task of a package.
+
+    Those of a `gym:ID` are its arguments, which are all given by the user.
+    """
     base = task.removesuffix("-v").removesuffix("-p")
-    found = written(TASKS[base]) if base in TASKS else {}
-    return {name: list(value) if isinstance(value, tuple) else value for name, value in found.items()}
+    if base in TASKS:
+        return {
+            name: list(value) if isinstance(value, tuple) else value for name, value in written(TASKS[base]).items()
+        }
+    if base in ROBOTS:
+        return dict(ROBOTS[base].arguments)
+    return {} if task.startswith(PREFIX) else None
 
 
 def _declared(group: str, ours: dict[str, str]) -> dict[str, str]:

@@ -17,9 +17,10 @@ from beliefrl.analysis.aggregate import (
     profile,
     scores,
 )
-from beliefrl.analysis.groups import find, groups, is_finished, last_step, left_out
+from beliefrl.analysis.groups import find, groups, is_finished, last_step, left_out, task_label
 from beliefrl.analysis.results import cut
 from beliefrl.runs.run import Run
+from beliefrl.tasks import describe, make
 from beliefrl.types import UserError
 from inputs import a_run, flat
 
@@ -90,6 +91,26 @@ def test_constants_of_a_task_set_it_apart_from_the_same_task_only(tmp_path):
         a_run(tmp_path / "c", [flat(1.0)], task="cartpole", constants={"track": 2.4}),
     ]
     assert [group.task for group in groups(made)] == ["pendulum-v", "pendulum-v length=2.0", "cartpole track=2.4"]
+
+
+@pytest.mark.parametrize("name", ["pendulum-v", "cartpole", "cartpole-p", "target-reaching"])
+def test_a_task_with_its_default_constants_has_only_its_name(name, tmp_path):
+    run = a_run(tmp_path / "a", [flat(1.0)], task=name, constants=describe(make(name))["constants"])
+    assert task_label(run) == name
+
+
+def test_other_constants_are_named_also_if_all_runs_have_them(tmp_path):
+    given = {"pendulum": {"mass": 1.5}, "gym:Arm-v0": {"stiffness": 0.3, "measures": ["success"]}}
+    robot = {"include_cfrc_ext_in_observation": False}
+    runs = [a_run(tmp_path / name, [flat(1.0)], task=name, constants=constants) for name, constants in given.items()]
+    ant = a_run(tmp_path / "ant", [flat(1.0)], task="mujoco-ant-v", constants=robot)
+    theirs = a_run(tmp_path / "theirs", [flat(1.0)], task="my-task", constants={"length": 2.0})
+    assert list(map(task_label, [*runs, ant, theirs])) == [
+        "pendulum mass=1.5",
+        "gym:Arm-v0 stiffness=0.3",
+        "mujoco-ant-v",
+        "my-task",
+    ]
 
 
 def test_action_repeat_is_named_with_the_task_and_its_steps_are_those_of_the_agent(tmp_path):
@@ -256,7 +277,8 @@ def test_a_task_on_which_all_seeds_diverged_at_once_still_counts(tmp_path):
 def test_bounds_are_of_a_task_its_masked_versions_and_its_faults_but_not_of_other_constants():
     for name in ("pendulum", "pendulum-v", "pendulum-p", "pendulum-v noise=0.1", "pendulum steps_per_action=2"):
         assert known_bounds(name) == BOUNDS["pendulum"]
-    assert known_bounds("pendulum max_steps=400") is None
+    for name in ("pendulum max_steps=400", "cartpole max_theta=0.1"):
+        assert known_bounds(name) is None
     assert known_bounds("cartpole-swing-up") is None
 
 
@@ -288,9 +310,13 @@ def test_what_the_scores_leave_out_is_named(tmp_path):
     ]
     assert notes(groups(runs)) == [
         "left out: pendulum: not all agents have an evaluation at the same step there",
-        "the numbers of seeds differ: a task with more seeds of an agent counts more for this agent",
     ]
     assert notes(groups(runs[:2])) == []
+    runs.append(a_run(tmp_path / "d", [flat(-150.0, -140.0)], agent="slac", task="pendulum"))
+    assert notes(groups(runs)) == [
+        "pendulum is compared at step 10, the last that all agents have; one has 20",
+        "an agent with more seeds on one task than on another counts that task more",
+    ]
 
 
 def test_a_curve_that_ends_early_names_the_run_that_ends_it(tmp_path):

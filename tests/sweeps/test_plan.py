@@ -1,6 +1,7 @@
 """The list of trainings in a sweep."""
 
 import json
+import shutil
 
 import pytest
 
@@ -78,6 +79,12 @@ def test_a_sweep_passes_on_how_trainings_start_and_end(tmp_path):
     recorder.log(3, "evaluation", 35, {"sampled": [-200.0], "mode": [-999.0]})
     assert training.is_finished(tmp_path)
     recorder.close()
+    shutil.copytree(tmp_path / training.name, tmp_path / "again" / training.name)
+    (tmp_path / "again" / training.name / "results.json").unlink()
+    assert not training.is_finished(tmp_path / "again")
+    with (tmp_path / "again" / training.name / "metrics" / "seed-3.jsonl").open("a") as log:
+        log.write(json.dumps({"step": 40, "kind": "diverged", "why": "a loss"}) + "\n")
+    assert training.is_finished(tmp_path / "again")  # another try would select the seeds that survive
     (tmp_path / training.name / "config.json").write_text("{")
     assert not training.is_finished(tmp_path)  # the training says that its run is damaged
 

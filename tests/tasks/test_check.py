@@ -264,7 +264,8 @@ class Broken:
 
     @property
     def spec(self):
-        return Spec(3, 1, None if self.part == "max_steps" else 10)
+        measures = ("success",) if self.part == "measures" else ()
+        return Spec(3, 1, None if self.part == "max_steps" else 10, measures)
 
     def reset(self, key):
         if self.part == "error":
@@ -273,20 +274,30 @@ class Broken:
 
     def step(self, state, action, key):
         state = state[:1] if self.part == "state" else state
-        reward = action if self.part == "reward" else action[0]
+        reward = {"reward": action, "whole": jnp.int32(1)}.get(self.part, action[0])
         terminated = jnp.float32(0) if self.part == "terminated" else jnp.bool_(False)
-        made = state, jnp.zeros(()) if self.part == "scalar" else jnp.zeros(3), reward, terminated
+        obs = {"scalar": jnp.zeros(()), "list": [0.0] * 3, "type": jnp.zeros(3, int)}.get(self.part, jnp.zeros(3))
+        made = state, obs, reward, terminated
         return made[:3] if self.part == "three" else made
 
 
 @pytest.mark.parametrize(
     ("part", "phrase"),
     [
-        ("max_steps", r"max_steps of .*Broken\.spec=None is impossible: it must be a whole number of at least 1"),
         ("error", r"reset of .*Broken cannot be traced: ValueError: no motor"),
-        ("observation", r"reset of .*Broken returns an observation of shape \(4,\), but its spec says \(3,\)"),
-        ("scalar", r"step of .*Broken returns an observation of shape \(\), but its spec says \(3,\)"),
-        ("reward", r"step of .*Broken returns a reward of shape \(1,\): return one number"),
+        (
+            "observation",
+            r"reset of .*Broken returns an observation that is float32 of shape \(4,\), not an array of shape \(3,\)",
+        ),
+        (
+            "scalar",
+            r"step of .*Broken returns an observation that is float32 of shape \(\), not an array of shape \(3,\)",
+        ),
+        ("list", r"step of .*Broken returns an observation that is no array"),
+        ("type", r"step of .*Broken returns an observation that is int32 of .* and of one type"),
+        ("reward", r"step of .*Broken returns a reward that is float32 of shape \(1,\): return one float"),
+        ("whole", r"step of .*Broken returns a reward that is int32 of shape \(\): return one float"),
+        ("measures", r"Broken has measures in its spec, but no method measures"),
         ("terminated", r"step of .*Broken returns no bool for terminated"),
         ("state", r"step of .*Broken returns a state with other shapes or types than reset"),
         ("three", r"step of .*Broken does not return \(state, observation, reward, terminated\)"),
@@ -298,3 +309,14 @@ def test_a_task_in_jax_that_does_not_fit_its_spec_is_refused_before_a_folder_is_
         beliefrl.train("sac-mlp", Broken(part), tmp_path / "run", progress=False)
     assert not (tmp_path / "run").exists()
     assert beliefrl.check(Broken()).refusals == ()
+
+
+def test_a_spec_that_is_none_is_refused(tmp_path):
+    class Bare(Broken):
+        spec = (3, 1, 10)
+
+    with pytest.raises(UserError, match=r"Bare\.spec is \(3, 1, 10\): give a beliefrl\.Spec"):
+        beliefrl.train("sac-mlp", Bare(), tmp_path / "run", progress=False)
+    for call in (beliefrl.check, lambda task: beliefrl.with_action_repeat(task, 2)):
+        with pytest.raises(UserError, match=r"max_steps of Broken\.spec=None is impossible: .* of at least 1"):
+            call(Broken("max_steps"))

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from beliefrl import agents
 from beliefrl.models import reading
 from beliefrl.training import replay as ring
 from beliefrl.training import rollout
@@ -100,6 +101,12 @@ def test_starts_are_uniform(least):
     possible = count - (least or shape.length)
     assert set(np.flatnonzero(drawn)) == set(range(possible))
     assert np.abs(drawn[:possible] / drawn.sum() * possible - 1).max() < 0.2
+
+
+def test_the_newest_transition_is_drawn_also_for_returns_of_several_steps():
+    shape = agents.make("sac-mlp", n_step=5).window
+    window = sample(filled(64, np.zeros(30, bool)), jax.random.key(2), 5_000, shape)
+    assert set(np.array(window.note[0])[0].astype(int)) == set(range(29))
 
 
 def test_history_and_annotate_address_the_first_timesteps():

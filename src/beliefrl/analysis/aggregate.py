@@ -93,16 +93,20 @@ def common_steps(groups: Sequence[Group], mode: str = "sampled") -> dict[str, in
 
 
 def notes(groups: Sequence[Group], mode: str = "sampled") -> list[str]:
-    """A sentence for each task that the scores leave out, and one if tasks do not weigh the same."""
+    """A sentence for each task that is left out, or compared before the last step of an agent; and one for weights."""
     usable = _usable(groups, mode)
-    steps = common_steps(usable, mode)
-    said = [
-        f"left out: {task}: not all agents have an evaluation at the same step there"
-        for task in tasks_of(groups)
-        if task not in steps
-    ]
-    if len({len(group.seeds) for group in usable if group.task in steps}) > 1:
-        said.append("the numbers of seeds differ: a task with more seeds of an agent counts more for this agent")
+    steps, said = common_steps(usable, mode), []
+    for task in tasks_of(groups):
+        last = max(
+            (int(g.curve(mode).steps[-1]) for g in usable if g.task == task and g.curve(mode).steps.size), default=0
+        )
+        if task not in steps:
+            said.append(f"left out: {task}: not all agents have an evaluation at the same step there")
+        elif steps[task] < last:
+            said.append(f"{task} is compared at step {steps[task]:,}, the last that all agents have; one has {last:,}")
+    counted = [(group.label, len(group.seeds)) for group in usable if group.task in steps]
+    if len(set(counted)) > len(dict(counted)):
+        said.append("an agent with more seeds on one task than on another counts that task more")
     return said
 
 
@@ -120,7 +124,7 @@ def known_bounds(task: str) -> tuple[float, float] | None:
     `task` is the task's name in figures (`groups.task_label`). With other constants the returns have other bounds.
     """
     name, *changed = task.split()
-    if usual_constants(name).keys() & {word.partition("=")[0] for word in changed}:
+    if (usual_constants(name) or {}).keys() & {word.partition("=")[0] for word in changed}:
         return None
     return BOUNDS.get(name.removesuffix("-v").removesuffix("-p"))
 
@@ -164,12 +168,12 @@ def draw_aggregate(groups: Sequence[Group], out: pathlib.Path, mode: str = "samp
 def _legend(table: dict[str, Scores], groups: Sequence[Group], mode: str) -> str:
     """The legend's title: tasks, seeds, actions, diverged seeds and intervals."""
     tasks, seeds = len(next(iter(table.values()))), {len(task) for of in table.values() for task in of}
-    lost = sum(int(group.diverged.sum()) for group in groups if group.task in common_steps(groups, mode))
+    lost = sum(int(group.diverged.sum()) for group in groups if group.task in common_steps(_usable(groups, mode), mode))
     return "; ".join(
         [
             f"{tasks} task{'s' * (tasks > 1)}, {counts(seeds)} seed{'s' * (max(seeds) > 1)} of each",
             *(["mode actions"] if mode == "mode" else []),
             *([f"{lost} diverged, with score 0"] if lost else []),
-            "95 % stratified bootstrap intervals" if max(seeds) > 1 else "no intervals with one seed",
+            "95 % stratified bootstrap intervals" + (", none with one seed on a task" if min(seeds) == 1 else ""),
         ]
     )

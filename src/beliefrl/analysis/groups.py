@@ -195,18 +195,19 @@ def groups(
     filled = {agent: usual[agent] | (before or {}).get(agent, {}) for agent in usual}
     settings = {run.folder: filled[run.config["agent"]] | run.config["hyperparameters"] for run in runs}
     seeds: dict[tuple[str, str], dict[int, Run]] = {}
+    names = {run.folder: task_label(run) for run in runs}
     for run in runs:
         same_agent = [settings[other.folder] for other in runs if other.config["agent"] == run.config["agent"]]
-        same_task = [other.config["constants"] for other in runs if task_label(other) == task_label(run)]
-        task = " ".join([task_label(run), *_differences(run.config["constants"], same_task)])
+        same_task = [other.config["constants"] for other in runs if names[other.folder] == names[run.folder]]
+        task = " ".join([names[run.folder], *_differences(run.config["constants"], same_task)])
         own = results.changed(settings[run.folder], usual[run.config["agent"]])
         label = " ".join([run.config["agent"], *_differences(own, same_agent), *_options(run)])
         of = seeds.setdefault((task, label), {})
         for seed in run.seeds:
             if seed not in of or _precedence(run, seed) > _precedence(of[seed], seed):
                 of[seed] = run
-    tasks, labels = ([*dict.fromkeys(names)] for names in zip(*seeds, strict=True)) if seeds else ([], [])
-    merged = [Group(*names, [(of[seed], seed) for seed in sorted(of)]) for names, of in seeds.items()]
+    tasks, labels = ([*dict.fromkeys(each)] for each in zip(*seeds, strict=True)) if seeds else ([], [])
+    merged = [Group(*each, [(of[seed], seed) for seed in sorted(of)]) for each, of in seeds.items()]
     return sorted(merged, key=lambda group: (tasks.index(group.task), labels.index(group.label)))
 
 
@@ -242,11 +243,12 @@ def left_out(runs: Sequence[Run], shown: Sequence[Group]) -> list[str]:
 
 def shortened_by(group: Group) -> str | None:
     """A sentence if the curve of a group ends early, because one of its runs does; None if not."""
-    going = [pair for pair, diverged in zip(group.seeds, group.diverged, strict=True) if not diverged]
+    going = [group.seeds[index] for index in np.flatnonzero(~group.diverged)]
+    ends = [group.seeds[index] for index in np.flatnonzero(~group.diverged & ~group.stopped)] or going
     steps = group.curve().steps
     if not (going and steps.size):
         return None
-    (run, seed), longest = min(going, key=lambda pair: last_step(*pair)), max(last_step(*pair) for pair in going)
+    (run, seed), longest = min(ends, key=lambda pair: last_step(*pair)), max(last_step(*pair) for pair in going)
     if steps[-1] >= longest:
         return None
     return (
@@ -260,13 +262,17 @@ def _precedence(run: Run, seed: int) -> tuple[int, str]:
 
 
 def task_label(run: Run) -> str:
-    """The name of a task in figures, with selected entries, faults, action repeat and changed constants, if any."""
+    """The name of a task in figures, with selected entries, faults, action repeat and changed constants, if any.
+
+    The default constants of a task of another package are not known, so they do not count as changed.
+    """
     seen = run.config.get("observe")
     observed = ["observe", *map(str, seen)] if seen else []
     faults = [f"{name}={value}" for name, value in run.config.get("faults", {}).items()]
-    usual = {"steps_per_action": 1} | usual_constants(run.config["task"])
-    given = {name: value for name, value in run.config["constants"].items() if name != "measures"}
-    changed = [f"{name}={value}" for name, value in given.items() if name not in usual or value != usual[name]]
+    constants = run.config["constants"]
+    known = usual_constants(run.config["task"])
+    usual = {"steps_per_action": 1, "measures": constants.get("measures")} | (constants if known is None else known)
+    changed = [f"{name}={value}" for name, value in constants.items() if name not in usual or value != usual[name]]
     return " ".join([run.config["task"], *observed, *faults, *changed])
 
 

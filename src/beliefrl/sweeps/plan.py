@@ -63,15 +63,19 @@ class Training:
         ]
 
     def is_finished(self, sweep: pathlib.Path) -> bool:
-        """Whether the run has been evaluated at its last step, or has reached `stop_at`."""
+        """Whether the run was evaluated at its last step, has reached `stop_at`, or all its seeds have diverged."""
         folder = sweep / self.name
-        if not (folder / "results.json").exists():
+        if not (folder / "config.json").exists():
             return False
         options = options_of(self)
         try:
             run = Run(folder)
-            has_all_steps = ((run.results() or {}).get("step") or 0) >= self.steps
-            return has_all_steps or run.reached(options.stop_at, options.stop_patience)
+            if all(map(run.has_diverged, run.seeds)):
+                return True
+            results = run.results()
+            if results is None:
+                return False
+            return (results.get("step") or 0) >= self.steps or run.reached(options.stop_at, options.stop_patience)
         except UserError:
             return False  # it is damaged, and the training says so
 

@@ -105,7 +105,7 @@ def writing(folder: pathlib.Path) -> Iterator[None]:
     """Raise a UserError in place of an OSError, such as that of a full disk."""
     try:
         yield
-    except BrokenPipeError:  # the reader of the output has closed it
+    except ConnectionError:  # also BrokenPipeError: the reader of the output has closed it
         raise
     except OSError as error:
         raise UserError(

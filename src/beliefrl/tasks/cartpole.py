@@ -45,8 +45,8 @@ class CartPole:
     """s, duration of a step."""
     max_x: float = 2.4
     """m, distance from the middle at which the episode terminates."""
-    max_theta: float = math.radians(12.0)
-    """rad, angle at which the episode terminates."""
+    max_theta: float = 0.20943951023931956
+    """rad, angle at which the episode terminates: 12°."""
     max_steps: int = 1000
     """Time limit in steps."""
 

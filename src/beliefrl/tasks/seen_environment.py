@@ -32,6 +32,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         self.task, self.seed = task, seed
         self.steps, self.length = 0, 0  # actions in total, and steps of the environment in this episode
         self._measured: dict[str, float] = {}  # in this episode
+        self._bare: Any = None  # the innermost environment, while it is in use
         self.inner = task.bare()
         self._check_new()
         self.inner_action_space: Any = getattr(self.inner, "action_space", None)
@@ -44,7 +45,9 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def _check_new(self) -> None:
         """Raise a UserError if `make` has returned an environment that is in use: two would step the same one."""
-        bare = getattr(self.inner, "unwrapped", self.inner)
+        bare = self.inner
+        with contextlib.suppress(Exception):  # an environment may be anything
+            bare = self.inner.unwrapped
         if _in_use.get(id(bare), self) is bare:
             raise UserError(
                 f"{self.task.name} is one environment, which is already in use: make a new one in each call, such as "
@@ -52,6 +55,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
             )
         with contextlib.suppress(TypeError):  # its class may not allow weak references
             _in_use[id(bare)] = bare
+            self._bare = bare
 
     def _prepare(self, task: Any) -> None:
         """Check the spaces; set which entries are observed, and the time limit."""
@@ -120,9 +124,11 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def close(self) -> None:
         """Close the environment, ignoring errors."""
+        if self._bare is not None:
+            _in_use.pop(id(self._bare), None)
+            self._bare = None
         with contextlib.suppress(Exception):
             self.inner.close()
-        _in_use.pop(id(getattr(self.inner, "unwrapped", self.inner)), None)
 
     def _fault(self, what: str) -> Fault:
         seed = f"{self.seed}, " if self.seed else ""
@@ -193,11 +199,10 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         return float(value)
 
     def _flag(self, value: Any, name: str) -> bool:
-        if isinstance(value, np.ndarray | np.generic) or hasattr(value, "__array__"):
-            value = np.asarray(value).item() if np.ndim(value) == 0 else value
-        if not isinstance(value, bool | int) or value not in (0, 1):
+        flag = as_array(value)
+        if flag.shape != () or flag.dtype.kind not in "biu" or flag not in (0, 1):
             raise self._fault(f"{name} is {short(value)}, but must be True or False")
-        return bool(value)
+        return bool(flag)
 
 
 def _time_limit(environment: Any) -> int | None:

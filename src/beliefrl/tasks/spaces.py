@@ -144,6 +144,8 @@ def _leaf_fits(space: Any, obs: Any) -> bool:
         with np.errstate(invalid="ignore"):
             return np.issubdtype(space.dtype, np.floating) or np.array_equal(part.astype(space.dtype), part)
     value, start = as_array(obs), getattr(space, "start", 0)
+    if value.size != np.prod(space.shape, dtype=int):
+        return False
     sizes = getattr(space, "nvec", getattr(space, "n", None)) if not isinstance(space, spaces.MultiBinary) else 2
     if value.dtype.kind not in "biuf" or sizes is None:
         return False

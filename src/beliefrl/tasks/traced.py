@@ -5,34 +5,44 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from beliefrl.types import UserError, check_whole, said
+from beliefrl.types import Spec, UserError, check_whole, said, short
 
 
 def check_traced(task: Any, name: str) -> None:
     """Trace `reset` and `step` of a task, and compare what they return with its `spec`.
 
     Raises:
-        UserError: one of them raises an error or returns another number of values; a size in `spec` is no number from
-            1; an observation is not (obs,); the reward is no number; `terminated` is no bool; or `step` returns a
-            state with other arrays than `reset`.
+        UserError: one of them raises an error or returns another number of values; an observation is not (obs,); the
+            reward is no float; `terminated` is no bool; `step` returns a state with other arrays than `reset`; or the
+            task has no method for its measures.
     """
     spec = task.spec
-    for size in ("obs_dim", "action_dim", "max_steps"):
-        check_whole(f"{size} of {name}.spec", getattr(spec, size, None), 1)
-    key, action = jax.random.key(0), jax.ShapeDtypeStruct((spec.action_dim,), jnp.float32)
+    key, action = jax.random.key(0), jax.ShapeDtypeStruct((spec.action_dim,), jnp.zeros(()).dtype)
     state, first = _returned(f"reset of {name}", 2, task.reset, key)
     after, obs, reward, terminated = _returned(f"step of {name}", 4, task.step, state, action, key)
     for of, value in {"reset": first, "step": obs}.items():
-        if _shape(value) != (spec.obs_dim,):
+        if _shape(value) != (spec.obs_dim,) or value.dtype != first.dtype:
             raise UserError(
-                f"{of} of {name} returns an observation of shape {_shape(value)}, but its spec says {(spec.obs_dim,)}."
+                f"{of} of {name} returns an observation that is {_described(value)}, not an array of shape "
+                f"{(spec.obs_dim,)}, as its spec says, and of one type."
             )
-    if _shape(reward) != ():
-        raise UserError(f"step of {name} returns a reward of shape {_shape(reward)}: return one number.")
+    if _shape(reward) != () or not jnp.issubdtype(reward.dtype, jnp.floating):
+        raise UserError(f"step of {name} returns a reward that is {_described(reward)}: return one float.")
     if _shape(terminated) != () or terminated.dtype != jnp.bool_:
         raise UserError(f"step of {name} returns no bool for terminated: return an array of shape () and type bool.")
     if _arrays(state) != _arrays(after):
         raise UserError(f"step of {name} returns a state with other shapes or types than reset: return the same.")
+    if spec.measures and not hasattr(task, "measures"):
+        raise UserError(f"{name} has measures in its spec, but no method measures(state).")
+
+
+def check_spec(task: Any) -> None:
+    """Raise a UserError if the sizes in the `spec` of a JAX task are no numbers from 1."""
+    name, spec = type(task).__name__, task.spec
+    if not isinstance(spec, Spec):
+        raise UserError(f"{name}.spec is {short(spec)}: give a beliefrl.Spec.")
+    for size in ("obs_dim", "action_dim", "max_steps"):
+        check_whole(f"{size} of {name}.spec", getattr(spec, size), 1)
 
 
 def _returned(what: str, count: int, function: Any, *args: Any) -> tuple[Any, ...]:
@@ -51,6 +61,10 @@ def _returned(what: str, count: int, function: Any, *args: Any) -> tuple[Any, ..
 
 def _shape(value: Any) -> Any:
     return getattr(value, "shape", None)
+
+
+def _described(value: Any) -> str:
+    return "no array" if _shape(value) is None else f"{value.dtype} of shape {value.shape}"
 
 
 def _arrays(state: Any) -> Any:

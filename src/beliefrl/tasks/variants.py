@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Key
 from beliefrl.tasks.faults import NONE, STREAM, Draws, Faults
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.repeat import LONGEST, actions, repeated_step
+from beliefrl.tasks.traced import check_spec
 from beliefrl.types import Spec, UserError, check_indices, check_whole, short
 
 
@@ -134,6 +135,7 @@ def as_task(task: Any) -> Any:
             f"{short(task)} is no task: give a task (make_task makes one from its name), a GymnasiumTask, or a class "
             "of Gymnasium environments."
         )
+    check_spec(task)
     return task
 
 

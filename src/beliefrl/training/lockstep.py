@@ -109,9 +109,7 @@ class Lockstep:
         with settings_kept():  # an environment is made here too, to see its spaces
             try:
                 AsyncVectorEnv.__init__(self._envs, factories, **settings)
-            except (UserError, EOFError, ConnectionError):
-                raise
-            except Exception as error:  # such as an object that cannot be sent to a process
+            except (TypeError, AttributeError) as error:  # of an object that cannot be sent
                 raise UserError(
                     f"{self.task.name} cannot be sent to a process of its own ({said(error)}): make such objects in "
                     "its function or class, or use processes=never."
