@@ -128,7 +128,7 @@ def test_evaluate_prints_one_object_and_the_same_for_the_same_seed(trained):
     assert first != other
     assert first.count("\n") == 1
     result = json.loads(first)
-    assert set(result) == {"episodes", "sampled", "mode"}
+    assert set(result) == {"episodes", "diverged", "sampled", "mode"}
     assert result["episodes"] == 3
     for mode in ("sampled", "mode"):
         assert set(result[mode]) == {"mean", "sem", "seeds", "returns", "lengths", "success", "seeds_success"}
