@@ -104,12 +104,12 @@ def test_other_constants_are_named_also_if_all_runs_have_them(tmp_path):
     robot = {"include_cfrc_ext_in_observation": False}
     runs = [a_run(tmp_path / name, [flat(1.0)], task=name, constants=constants) for name, constants in given.items()]
     ant = a_run(tmp_path / "ant", [flat(1.0)], task="mujoco-ant-v", constants=robot)
-    theirs = a_run(tmp_path / "theirs", [flat(1.0)], task="my-task", constants={"length": 2.0})
+    theirs = a_run(tmp_path / "theirs", [flat(1.0)], task="my-task", constants={"length": 2.0, "steps_per_action": 2})
     assert list(map(task_label, [*runs, ant, theirs])) == [
         "pendulum mass=1.5",
         "gym:Arm-v0 stiffness=0.3",
         "mujoco-ant-v",
-        "my-task",
+        "my-task steps_per_action=2",
     ]
 
 

@@ -295,9 +295,8 @@ class Broken:
         ),
         ("list", r"step of .*Broken returns an observation that is no array"),
         ("type", r"step of .*Broken returns an observation that is int32 of .* and of one type"),
-        ("reward", r"step of .*Broken returns a reward that is float32 of shape \(1,\): return one float"),
-        ("whole", r"step of .*Broken returns a reward that is int32 of shape \(\): return one float"),
-        ("measures", r"Broken has measures in its spec, but no method measures"),
+        ("reward", r"step of .*Broken returns a reward that is float32 of shape \(1,\): return one float32"),
+        ("whole", r"step of .*Broken returns a reward that is int32 of shape \(\): return one float32"),
         ("terminated", r"step of .*Broken returns no bool for terminated"),
         ("state", r"step of .*Broken returns a state with other shapes or types than reset"),
         ("three", r"step of .*Broken does not return \(state, observation, reward, terminated\)"),
@@ -320,3 +319,5 @@ def test_a_spec_that_is_none_is_refused(tmp_path):
     for call in (beliefrl.check, lambda task: beliefrl.with_action_repeat(task, 2)):
         with pytest.raises(UserError, match=r"max_steps of Broken\.spec=None is impossible: .* of at least 1"):
             call(Broken("max_steps"))
+        with pytest.raises(UserError, match=r"Broken has measures in its spec, but no method measures\(state\)"):
+            call(Broken("measures"))

@@ -97,9 +97,8 @@ def notes(groups: Sequence[Group], mode: str = "sampled") -> list[str]:
     usable = _usable(groups, mode)
     steps, said = common_steps(usable, mode), []
     for task in tasks_of(groups):
-        last = max(
-            (int(g.curve(mode).steps[-1]) for g in usable if g.task == task and g.curve(mode).steps.size), default=0
-        )
+        there = [group for group in usable if group.task == task and not group.diverged.all()]
+        last = max((max(group.curve(mode).steps, default=0) for group in there), default=0)
         if task not in steps:
             said.append(f"left out: {task}: not all agents have an evaluation at the same step there")
         elif steps[task] < last:
@@ -168,7 +167,9 @@ def draw_aggregate(groups: Sequence[Group], out: pathlib.Path, mode: str = "samp
 def _legend(table: dict[str, Scores], groups: Sequence[Group], mode: str) -> str:
     """The legend's title: tasks, seeds, actions, diverged seeds and intervals."""
     tasks, seeds = len(next(iter(table.values()))), {len(task) for of in table.values() for task in of}
-    lost = sum(int(group.diverged.sum()) for group in groups if group.task in common_steps(_usable(groups, mode), mode))
+    usable = _usable(groups, mode)
+    steps = common_steps(usable, mode)
+    lost = sum(int(group.diverged.sum()) for group in usable if group.task in steps)
     return "; ".join(
         [
             f"{tasks} task{'s' * (tasks > 1)}, {counts(seeds)} seed{'s' * (max(seeds) > 1)} of each",

@@ -271,7 +271,7 @@ def task_label(run: Run) -> str:
     faults = [f"{name}={value}" for name, value in run.config.get("faults", {}).items()]
     constants = run.config["constants"]
     known = usual_constants(run.config["task"])
-    usual = {"steps_per_action": 1, "measures": constants.get("measures")} | (constants if known is None else known)
+    usual = (constants if known is None else known) | {"steps_per_action": 1, "measures": constants.get("measures")}
     changed = [f"{name}={value}" for name, value in constants.items() if name not in usual or value != usual[name]]
     return " ".join([run.config["task"], *observed, *faults, *changed])
 

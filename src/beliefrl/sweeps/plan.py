@@ -70,12 +70,12 @@ class Training:
         options = options_of(self)
         try:
             run = Run(folder)
-            if all(map(run.has_diverged, run.seeds)):
-                return True
             results = run.results()
-            if results is None:
-                return False
-            return (results.get("step") or 0) >= self.steps or run.reached(options.stop_at, options.stop_patience)
+            if results is not None and (results.get("step") or 0) >= self.steps:
+                return True
+            if results is not None and run.reached(options.stop_at, options.stop_patience):
+                return True
+            return all(map(run.has_diverged, run.seeds))
         except UserError:
             return False  # it is damaged, and the training says so
 

@@ -13,8 +13,7 @@ def check_traced(task: Any, name: str) -> None:
 
     Raises:
         UserError: one of them raises an error or returns another number of values; an observation is not (obs,); the
-            reward is no float; `terminated` is no bool; `step` returns a state with other arrays than `reset`; or the
-            task has no method for its measures.
+            reward is no float; `terminated` is no bool; or `step` returns a state with other arrays than `reset`.
     """
     spec = task.spec
     key, action = jax.random.key(0), jax.ShapeDtypeStruct((spec.action_dim,), jnp.zeros(()).dtype)
@@ -26,23 +25,26 @@ def check_traced(task: Any, name: str) -> None:
                 f"{of} of {name} returns an observation that is {_described(value)}, not an array of shape "
                 f"{(spec.obs_dim,)}, as its spec says, and of one type."
             )
-    if _shape(reward) != () or not jnp.issubdtype(reward.dtype, jnp.floating):
-        raise UserError(f"step of {name} returns a reward that is {_described(reward)}: return one float.")
+    if _shape(reward) != () or reward.dtype != action.dtype:
+        raise UserError(f"step of {name} returns a reward that is {_described(reward)}: return one {action.dtype}.")
     if _shape(terminated) != () or terminated.dtype != jnp.bool_:
         raise UserError(f"step of {name} returns no bool for terminated: return an array of shape () and type bool.")
     if _arrays(state) != _arrays(after):
         raise UserError(f"step of {name} returns a state with other shapes or types than reset: return the same.")
-    if spec.measures and not hasattr(task, "measures"):
-        raise UserError(f"{name} has measures in its spec, but no method measures(state).")
 
 
 def check_spec(task: Any) -> None:
-    """Raise a UserError if the sizes in the `spec` of a JAX task are no numbers from 1."""
+    """Raise a UserError if the sizes in the `spec` of a JAX task are no numbers from 1, or its measures have no method.
+
+    A task with action repeat has the spec of another task, which was checked before.
+    """
     name, spec = type(task).__name__, task.spec
     if not isinstance(spec, Spec):
         raise UserError(f"{name}.spec is {short(spec)}: give a beliefrl.Spec.")
     for size in ("obs_dim", "action_dim", "max_steps"):
         check_whole(f"{size} of {name}.spec", getattr(spec, size), 1)
+    if spec.measures and not callable(getattr(task, "measures", None)):
+        raise UserError(f"{name} has measures in its spec, but no method measures(state).")
 
 
 def _returned(what: str, count: int, function: Any, *args: Any) -> tuple[Any, ...]:

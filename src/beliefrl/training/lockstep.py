@@ -109,7 +109,9 @@ class Lockstep:
         with settings_kept():  # an environment is made here too, to see its spaces
             try:
                 AsyncVectorEnv.__init__(self._envs, factories, **settings)
-            except (TypeError, AttributeError) as error:  # of an object that cannot be sent
+            except (UserError, EOFError, OSError, MemoryError):
+                raise
+            except Exception as error:  # of an object that cannot be sent
                 raise UserError(
                     f"{self.task.name} cannot be sent to a process of its own ({said(error)}): make such objects in "
                     "its function or class, or use processes=never."
