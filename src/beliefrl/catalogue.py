@@ -118,13 +118,18 @@ def written(path: str) -> dict[str, Any]:
     return values
 
 
+def unmasked(task: str) -> str:
+    """The name of a task without -v or -p."""
+    return task.removesuffix("-v").removesuffix("-p")
+
+
 @functools.cache
 def usual_constants(task: str) -> dict[str, Any] | None:
     """The default constants of one of our tasks, with lists for tuples as in JSON; None for a task of a package.
 
     Those of a `gym:ID` are its arguments, which are all given by the user.
     """
-    base = task.removesuffix("-v").removesuffix("-p")
+    base = unmasked(task)
     if base in TASKS:
         return {
             name: list(value) if isinstance(value, tuple) else value for name, value in written(TASKS[base]).items()

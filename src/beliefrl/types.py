@@ -186,7 +186,7 @@ class WindowShape(NamedTuple):
     length: int
     readers: int = 0
     jump: float = 0.0  # probability that a reader jumps before it reads
-    least: int | None = None  # transitions of a window drawn at random that must be stored; None: `length`
+    least: int | None = None  # stored transitions that a randomly drawn window needs; None: `length`
 
 
 def transitions(window: Window, burn_in: int) -> Bool[Array, " length *batch"]:

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from beliefrl.analysis.figures import figure, save
 from beliefrl.analysis.groups import Group
 from beliefrl.analysis.panels import add_legend, colours, counts, legend_height, tasks_of, with_curve
-from beliefrl.catalogue import usual_constants
+from beliefrl.catalogue import unmasked, usual_constants
 from beliefrl.types import UserError
 
 Scores = Sequence[Float[np.ndarray, " seed"]]  # one array for each task
@@ -87,13 +87,14 @@ def common_steps(groups: Sequence[Group], mode: str = "sampled") -> dict[str, in
     for task in tasks_of(groups):
         there = [group for group in groups if group.task == task]
         steps = [set(group.curve(mode).steps.tolist()) for group in there if not group.diverged.all()]
-        if {group.label for group in there} == labels and (not steps or set.intersection(*steps)):
-            found[task] = max(set.intersection(*steps)) if steps else 0
+        common = set.intersection(*steps) if steps else {0}
+        if {group.label for group in there} == labels and common:
+            found[task] = max(common)
     return found
 
 
 def notes(groups: Sequence[Group], mode: str = "sampled") -> list[str]:
-    """A sentence for each task that is left out, or compared before the last step of an agent; and one for weights."""
+    """A sentence for each task left out or compared before an agent's last step; one if tasks count unequally."""
     usable = _usable(groups, mode)
     steps, said = common_steps(usable, mode), []
     for task in tasks_of(groups):
@@ -125,7 +126,7 @@ def known_bounds(task: str) -> tuple[float, float] | None:
     name, *changed = task.split()
     if (usual_constants(name) or {}).keys() & {word.partition("=")[0] for word in changed}:
         return None
-    return BOUNDS.get(name.removesuffix("-v").removesuffix("-p"))
+    return BOUNDS.get(unmasked(name))
 
 
 def _normalised(returns: np.ndarray, ends: tuple[float, float]) -> np.ndarray:

@@ -225,8 +225,8 @@ def _options(run: Run) -> list[str]:
 
 
 def left_out(runs: Sequence[Run], shown: Sequence[Group]) -> list[str]:
-    """A sentence for each run with seeds that no group counts, because another run has them, for each group without a
-    curve, and for each group whose curve ends before the last evaluation of its longest seed.
+    """A sentence for each run with seeds that are counted from another run, each group without a curve, and each group
+    whose curve ends before the last evaluation of its longest seed.
     """
     counted = {(run.folder, seed) for group in shown for run, seed in group.seeds}
     missing = {run.folder: [seed for seed in run.seeds if (run.folder, seed) not in counted] for run in runs}

@@ -69,7 +69,7 @@ class Pool(NamedTuple):
         return cls(samples, jnp.zeros((), int))
 
     def add(self, samples: Samples) -> "Pool":
-        """With the transitions (length, batch, ...) of one more cycle, which replace those of the oldest cycle."""
+        """The same with the transitions (length, batch, ...) of one more cycle in place of those of the oldest."""
         index = self.cycles % len(self.transitions.target)
 
         def write(ring: Array, new: Array) -> Array:

@@ -69,7 +69,7 @@ class Usual(NamedTuple):
     batches: Float[Array, ""]  # so far; without any, all rewards are usual
 
     def include(self, reward: Float[Array, "*batch"], valid: Bool[Array, "*batch"]) -> "Usual":
-        """With the valid rewards of one more batch."""
+        """The same with the valid rewards of one more batch."""
         batches = self.batches + jnp.any(valid)
         rate = jnp.any(valid) / jnp.maximum(batches, 1)
         median = jnp.nan_to_num(jnp.nanmedian(jnp.where(valid, reward, jnp.nan)))

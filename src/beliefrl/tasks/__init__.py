@@ -21,7 +21,6 @@ from beliefrl.tasks.variants import entries as entries
 from beliefrl.tasks.variants import entry_names as entry_names
 from beliefrl.tasks.variants import full as full
 from beliefrl.tasks.variants import steps_per_action as steps_per_action
-from beliefrl.tasks.variants import without_faults as without_faults
 from beliefrl.types import Spec, UserError, said, short, tuples
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from beliefrl.tasks.seen_environment import ENDLESS
 
 SCALES = 100.0  # entries whose largest magnitudes differ by more than this factor cause a warning
-SMALLEST_DEVIATION = 1e-3  # as in `models.nets`, which adds it to deviations: entries that vary less stay small
+SMALLEST_DEVIATION = 1e-3  # as in `models.scales`, which adds it to deviations: entries that vary less stay small
 OFFSET = 1e4  # standard deviations: a running mean in float32 does not follow a larger one well
 MOST_NAMED = 5  # entries in one warning
 

@@ -162,13 +162,13 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
             flat = self.whole[self.indices].astype(np.float32)
         if not np.isfinite(flat).all():
             entry = int(self.indices[~np.isfinite(flat)][0])
-            raise self._fault(f"entry {entry} of the observation{self._named(entry)} is {value.reshape(-1)[entry]}")
+            raise self._fault(f"entry {entry} of the observation{self._named(entry)} is {self.whole[entry]}")
         far = (flat < self._lowest) | (flat > self._highest)
         if far.any():
             entry = int(self.indices[far][0])
             bounds = flat_bounds(space)
             raise self._fault(
-                f"entry {entry} of the observation{self._named(entry)} is {value.reshape(-1)[entry]}, far outside its "
+                f"entry {entry} of the observation{self._named(entry)} is {self.whole[entry]}, far outside its "
                 f"space, which says {bounds.low[entry]} to {bounds.high[entry]}: correct the observation or its space"
             )
         return flat

@@ -22,8 +22,8 @@ def check_traced(task: Any, name: str) -> None:
     for of, value in {"reset": first, "step": obs}.items():
         if _shape(value) != (spec.obs_dim,) or value.dtype != first.dtype:
             raise UserError(
-                f"{of} of {name} returns an observation that is {_described(value)}, not an array of shape "
-                f"{(spec.obs_dim,)}, as its spec says, and of one type."
+                f"{of} of {name} returns an observation that is {_described(value)}: its spec says shape "
+                f"{(spec.obs_dim,)}, and reset and step must agree in type."
             )
     if _shape(reward) != () or reward.dtype != action.dtype:
         raise UserError(f"step of {name} returns a reward that is {_described(reward)}: return one {action.dtype}.")
@@ -34,7 +34,7 @@ def check_traced(task: Any, name: str) -> None:
 
 
 def check_spec(task: Any) -> None:
-    """Raise a UserError if the sizes in the `spec` of a JAX task are no numbers from 1, or its measures have no method.
+    """Raise a UserError if a size in a JAX task's `spec` is no whole number from 1, or its measures have no method.
 
     A task with action repeat has the spec of another task, which was checked before.
     """

@@ -180,7 +180,7 @@ def observe(task: Any, indices: tuple[int, ...]) -> Any:
         check_indices(indices, len(variant.indices))
         indices = tuple(variant.indices[i] for i in indices)
     chosen = dataclasses.replace(variant, indices=tuple(indices))
-    _ = chosen.spec  # checks those of an environment, in the only one that is made: it may be a robot
+    _ = chosen.spec  # checks the indices in the only environment that is made: it may be a robot
     return chosen
 
 
@@ -212,11 +212,6 @@ def with_action_repeat(task: Any, steps_per_action: int) -> Any:
     """
     check_whole("steps_per_action", steps_per_action, 1, LONGEST)
     return _changed(as_task(task), steps_per_action=int(steps_per_action))
-
-
-def without_faults(task: Any) -> Any:
-    """The same task without its faults."""
-    return _changed(task, faults=NONE)
 
 
 def full(task: Any) -> Any:

@@ -127,9 +127,9 @@ def sample(replay: Replay, key: Key[Array, ""], batch: int, shape: WindowShape) 
     """Draw `batch` windows of burn_in + length + 1 timesteps, leaves (time, batch, ...).
 
     The first transition after the burn-in is uniform over all starts whose `length` transitions (or `least`) are
-    stored, so every stored transition can be drawn. The burn-in overhangs where too little lies before it; with fewer
-    timesteps than a window needs the rest overhangs as well. What overhangs is marked in `exists`. With several rings,
-    the start is uniform over those of all rings.
+    stored, so every stored transition can be drawn. If too little lies before it, the burn-in
+    overhangs. If a window needs more timesteps than there are, the rest does, too. `exists` marks what is there. With
+    several rings, the start is uniform over those of all rings.
     """
     start, ring = places(replay, key, batch, shape.length if shape.least is None else shape.least)
     oldest, added = (bound[None] for bound in span(replay, ring))
