@@ -56,7 +56,7 @@ def main(quick: bool = False) -> None:
 
     for row in run.rows(seed=0, kind="evaluation"):
         print(f"step {row['step']}: return {np.mean(row['mode']):.1f}")
-    policy, environment = beliefrl.load(run, task=task), task.environment()
+    policy, environment = beliefrl.load(run), beliefrl.make_env(task)
     obs, _ = environment.reset(seed=1)
     action, state = policy.predict(obs)
     for step in range(40):

@@ -38,7 +38,7 @@ class State(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class SLACAgent(SACAgent):
-    """Critics on the latent state of a learned model, an actor on the last eight observations (Lee et al. 2019)."""
+    """Critics on the latent state of a learned model, an actor on the last 8 timesteps (Lee et al. 2019)."""
 
     seq_len: int = 8
     """Steps in a sampled sequence (Lee et al. 2019)."""
