@@ -51,7 +51,6 @@ MISTAKES = {
     "train slac pendulum-v --history 0": "history=0 is impossible",
     "train sac-lstm pendulum-v --burn-in -1": "burn_in=-1 is impossible",
     "train sac-mlp pendulum-v --seq-len 4": "There is no option --seq-len",
-    f"{TRAIN} --models three": "--models must be one of 'both', 'single', 'first', 'keep', not 'three'",
     f"{TRAIN} --precision tf32": "--precision must be one of 'float32', 'tensorfloat32', 'bfloat16', not 'tf32'",
     f"{TRAIN} --elbo-scaling foo": "--elbo-scaling must be one of 'mean', 'sum', not 'foo'",
     f"{TRAIN} --train-interval-rl 3": "train_interval_klvrm=5 is not a multiple of train_interval_rl=3",

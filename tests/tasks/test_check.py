@@ -84,10 +84,10 @@ def test_constants_may_have_the_names_of_the_command(capsys):
 
 
 @pytest.mark.usefixtures("unchecked")
-@pytest.mark.parametrize("number", [1.5, "3", 0])
-def test_steps_are_a_whole_number(number):
-    with pytest.raises(UserError, match=f"steps={number!r} is impossible: it must be a whole number"):
-        beliefrl.check("pendulum", steps=number)
+@pytest.mark.parametrize(("name", "number"), [("steps", 1.5), ("steps", "3"), ("steps", 0), ("seed", -1)])
+def test_another_number_than_a_whole_one_in_the_range_is_one_sentence(name, number):
+    with pytest.raises(UserError, match=f"^{name}={number!r} is impossible: it must be a whole number"):
+        beliefrl.check("pendulum", **{name: number})
 
 
 def test_the_time_limit_of_a_compiled_task_ends_episodes():
@@ -247,13 +247,6 @@ def test_the_command_shows_the_entries_and_refuses_with_one_sentence(capsys):
     assert end.value.code == 2
     assert "sin θ" in out
     assert err == "beliefrl: 7 is not an index of the observation, which has 3 entries: give indices from 0 to 2.\n"
-
-
-@pytest.mark.parametrize("wrong", [{"steps": 0}, {"seed": -1}])
-def test_a_number_out_of_range_is_one_sentence(wrong):
-    (name,) = wrong
-    with pytest.raises(UserError, match=f"{name}=.* is impossible: it must be a whole number"):
-        beliefrl.check("pendulum", **wrong)
 
 
 @dataclasses.dataclass(frozen=True)

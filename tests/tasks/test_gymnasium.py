@@ -120,15 +120,17 @@ def test_making_an_environment_changes_neither_the_working_directory_nor_jax(tmp
 
     monkeypatch.chdir(tmp_path)
     assert GymnasiumTask(Moving).spec.obs_dim == 2
+    assert pathlib.Path.cwd() == tmp_path
     assert not beliefrl.check(Moving, steps=3).refusals
+    assert pathlib.Path.cwd() == tmp_path
     for look in (lambda: GymnasiumTask(Failing).spec, lambda: beliefrl.check(Failing)):
         with pytest.raises(UserError, match="cannot be made: OSError: no port"):
             look()
+        assert pathlib.Path.cwd() == tmp_path
     with pytest.raises(UserError, match="cannot be made: OSError: no port"):
         Lockstep(GymnasiumTask(Failing), ["seed 0"], "never")
-    assert not jax.config.read("jax_enable_x64")
-    monkeypatch.chdir(tmp_path)  # the environments of a training stay where they moved
     assert pathlib.Path.cwd() == tmp_path
+    assert not jax.config.read("jax_enable_x64")
 
 
 @pytest.mark.parametrize(
