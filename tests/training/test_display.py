@@ -136,11 +136,37 @@ def test_an_evaluation_that_takes_seconds_shows_how_many_episodes_are_over(tmp_p
     assert "2 of 4 episodes are over" in lines
 
 
-FLAT = {"mean": 1.0, "sem": None, "seeds": [1.0], "success": None}
+def evaluated(sampled, mode):
+    """The two kinds of actions of one seed in three episodes."""
+    return np.stack([np.broadcast_to(sampled, 3), np.broadcast_to(mode, 3)])[None]
 
 
-def evaluation(value):
-    return Episode(*(np.full((1, 2, 3), each) for each in (True, value, 10)), {})
+EVALUATION = Episode(
+    evaluated(True, True), evaluated(-7.0, -3.0), evaluated(10, 10), {"success": evaluated([1.0, 0.0, 0.0], 1.0)}
+)
+LINE = "step 40: return -7.0 sampled, -3.0 mode; success 33% sampled, 100% mode"
+RESULTS = {
+    "sampled": {
+        "mean": -7.0,
+        "sem": 0.3,
+        "seeds": [-7.3, None, -6.7],
+        "success": 0.5,
+        "seeds_success": [0.2, None, 0.8],
+    },
+    "mode": {"mean": -3.0, "sem": 0.1, "seeds": [-3.1, None, -2.9], "success": 1.0, "seeds_success": [1.0, None, 1.0]},
+}
+
+
+def test_a_table_of_results_has_each_number_below_the_kind_of_its_actions():
+    table = results_table(RESULTS, [4, 5, 6], "title")
+    headings, *rows = zip(*([column.header, *column.cells] for column in table.columns), strict=True)
+    assert headings == ("seed", "sampled actions", "mode actions", "success sampled", "success mode")
+    assert rows == [
+        ("4", "-7.3", "-3.1", "20%", "100%"),
+        ("5", "diverged", "diverged", "-", "-"),
+        ("6", "-6.7", "-2.9", "80%", "100%"),
+        ("mean ± S.E.M.", "-7.0 ± 0.3", "-3.0 ± 0.1", "50%", "100%"),
+    ]
 
 
 def test_a_terminal_keeps_the_evaluations_and_replaces_the_rest(run):
@@ -148,9 +174,9 @@ def test_a_terminal_keeps_the_evaluations_and_replaces_the_rest(run):
     display = TrainingDisplay(shown, run)
     with shown:
         display(Event(Phase.LEARNING, 20))
-        display(Event(Phase.LEARNING, 40, evaluation=evaluation(-7.0)))
+        display(Event(Phase.LEARNING, 40, evaluation=EVALUATION))
     out = shown.console.file.getvalue()
-    assert "step 40: return -7.0 sampled, -7.0 mode" in out
+    assert LINE in out
     assert "learning\n" not in out
     assert "step 40/100" in out  # in the bar
 
@@ -182,16 +208,16 @@ def test_a_notebook_shows_the_status_the_evaluations_and_the_curve(tmp_path, cel
     with display.screen:
         display(Event(Phase.LEARNING, 20))
         assert "step 20/100" in cells[0]["text/plain"]
-        display(Event(Phase.LEARNING, 40, evaluation=evaluation(-7.0)))
+        display(Event(Phase.LEARNING, 40, evaluation=EVALUATION))
         display(Event(Phase.LEARNING, 60))
         lines = cells[0]["text/plain"].splitlines()
-        assert lines[0].endswith("step 40: return -7.0 sampled, -7.0 mode")
+        assert lines[0].endswith(LINE)
         assert "step 60/100" in lines[1]
         assert cells[1]["image/png"].startswith("iVBORw0KGgo")  # base64 of PNG
         monkeypatch.setattr(screens, "PACE", 60.0)
         display(Event(Phase.LEARNING, 80))
         assert "step 60/100" in cells[0]["text/plain"]  # not yet replaced
-        display.screen.show(results_table(dict.fromkeys(("sampled", "mode"), FLAT), [0], "title"))
+        display.screen.show(results_table(RESULTS, [4, 5, 6], "title"))
     assert cells[0]["text/plain"].splitlines()[0] == lines[0]
     assert "step 60/100" not in cells[0]["text/plain"]
     assert "\x1b" not in cells[0]["text/plain"]

@@ -3,6 +3,7 @@
 import json
 import os
 import pathlib
+import re
 import shutil
 import signal
 import subprocess
@@ -112,10 +113,14 @@ def test_a_training_is_evaluated_in_both_modes(trained):
         assert [row["step"] for row in evaluations] == [30, 60]
         assert all(len(row[mode]) == 2 for row in evaluations for mode in ("sampled", "mode"))
     results = Run(folder).results()
-    last = [rows(folder, seed, "evaluation")[-1]["mode"] for seed in range(2)]
-    np.testing.assert_allclose(results["mode"]["seeds"], np.mean(last, axis=1), rtol=1e-6)
+    for mode in ("sampled", "mode"):
+        last = [rows(folder, seed, "evaluation")[-1][mode] for seed in range(2)]
+        np.testing.assert_allclose(results[mode]["seeds"], np.mean(last, axis=1), rtol=1e-6)
     table = printed[printed.index("vrm on pendulum-v after 60 steps") :]
-    assert f"{results['mode']['mean']:.1f}" in table
+    (means,) = (line for line in table.splitlines() if "mean ± S.E.M." in line)
+    both = [f"{results[mode]['mean']:.1f} ± {results[mode]['sem']:.1f}" for mode in ("sampled", "mode")]
+    assert re.findall(r"-[\d.]+ ± [\d.]+", means) == both
+    assert both[0] != both[1]
     assert "saved in" in table.splitlines()[-2] + table.splitlines()[-1]
 
 
