@@ -176,29 +176,3 @@ def test_the_curve_of_one_run_is_drawn_and_of_two_it_is_asked_which(tmp_path, ca
 def test_a_report_has_the_runs_of_a_file_too(tmp_path):
     packed(tmp_path / "kept.json.gz", a_run(tmp_path / "one", [flat(1.0)]))
     assert "kept.json.gz/one" in write_report([tmp_path / "kept.json.gz"], tmp_path / "report.html").read_text()
-
-
-# The command `beliefrl figure` on folders of runs.
-
-
-@pytest.mark.parametrize("kind", ["curves", "ablation", "aggregate"])
-def test_a_figure_is_one_command(tmp_path, monkeypatch, capsys, kind):
-    monkeypatch.chdir(tmp_path)
-    a_run(tmp_path / "runs" / "done", [flat(1.0, 2.0)], task="pendulum")
-    a_run(tmp_path / "runs" / "going", [flat(1.0)], task="cartpole", steps=20)
-    cli.main(["figure", kind, "runs", "-o", "picture"])
-    out = capsys.readouterr().out
-    assert "left out: runs/going is not finished" in out
-    assert "written to picture.png and picture.pdf" in out
-    assert (tmp_path / "picture.png").exists()
-    cli.main(["figure", kind, "runs", "--tasks", "pendulum"])
-    assert "left out" not in capsys.readouterr().out
-    assert (tmp_path / f"{kind}.pdf").exists()
-
-
-def test_the_cost_table_is_printed_and_written(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    a_run(tmp_path / "done", [flat(1.0, 2.0)])
-    cli.main(["figure", "scalability", "done"])
-    assert (tmp_path / "scalability.md").read_text() in capsys.readouterr().out
-    assert (tmp_path / "scalability.tex").exists()
