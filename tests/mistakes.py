@@ -147,7 +147,7 @@ MISTAKES = {
     "figure curves untrained": "both selected and finished",
     "figure curves untrained --unfinished": "no curve to draw",
     "figure curves untrained --actions best": "--actions must be one of",
-    "figure curves untrained --out picture.jpg --unfinished": "no curve to draw",
+    "figure curves evaluated --out picture.jpg": "a figure is written as .png and .pdf",
     "evaluate": "RUN is missing",
     "evaluate missing": "no run folder missing",
     "evaluate there": "there is not a run",
@@ -346,14 +346,14 @@ def prepare(folder):
         "crowded": json.dumps(config | {"options": config["options"] | {"seeds": 10**9}}),
         "wide": json.dumps(config | {"hyperparameters": {"d_size": 10**9}}),
         "nameless": json.dumps(config | {"hyperparameters": {"name": 5}}),
-    } | dict.fromkeys(("untrained", "damaged", "scribbled", "halved", "resultless", "misshapen", "unlogged"), whole)
+    } | dict.fromkeys(("untrained", "damaged", "evaluated", "resultless", "misshapen", "unlogged"), whole)
     for name, content in contents.items():
         (folder / name / "metrics").mkdir(parents=True)
         (folder / name / "config.json").write_text(content)
     (folder / "damaged" / "agent.safetensors").write_bytes(b"nonsense")
     (folder / "damaged" / "checkpoints" / "damaged-000001-step-10").mkdir(parents=True)
-    (folder / "scribbled" / "metrics" / "seed-0.jsonl").write_text('{"step": 1, "kind": "update"}\nhello\n')
-    (folder / "halved" / "checkpoints" / ".000001-step-10.tmp").mkdir(parents=True)
+    evaluation = {"step": 100, "kind": "evaluation", "sampled": [1.0], "mode": [1.0]}
+    (folder / "evaluated" / "metrics" / "seed-0.jsonl").write_text(json.dumps(evaluation) + "\n")
     (folder / "unlogged" / "metrics" / "seed-0.jsonl").mkdir()
     (folder / "misshapen" / "results.json").write_text('{"step": 10, "sampled": 5}')
     (folder / "resultless" / "results.json").write_text('{"step": 10')

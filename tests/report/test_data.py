@@ -2,6 +2,7 @@
 
 import json
 import os
+import pathlib
 import re
 
 import numpy as np
@@ -95,6 +96,35 @@ def test_a_seed_that_diverged_is_left_out_and_page_data(tmp_path):
     assert group["curves"]["sampled"]["seeds"] == [[1.5, 4.0], [1.5, None]]
     assert group["final"]["sampled"] == {"count": 1, "mean": 4.0, "sem": None, "interval": None}
     assert page["runs"][0]["diverged"] == ["seed 1: a loss is not finite"]
+
+
+def test_a_group_without_a_curve_and_one_with_a_shorter_curve_are_named(tmp_path):
+    a_folder(tmp_path / "lost", [[], []], agent="slac", diverged=[0, 1])
+    a_folder(tmp_path / "done", TWO_SEEDS)
+    going = a_folder(tmp_path / "going", [TWO_SEEDS[0][:1]], first=2)
+    lost = "slac on pendulum-v has no curve: all seeds have diverged"
+    page = page_data(tmp_path)
+    assert [group["label"] for group in page["groups"]] == ["vrm"]
+    assert page["damage"] == [lost]
+    assert {pathlib.Path(run["folder"]).name: run["group"] for run in page["runs"]} == {
+        "lost": None,
+        "done": 0,
+        "going": None,
+    }
+    ends = f"{going}, seed 2, ends at 10, and another seed at 20"
+    early = f"vrm on pendulum-v ends at step 10, the last that all of its seeds have: {ends}"
+    assert page_data(tmp_path, unfinished=True)["damage"] == [lost, early]
+
+
+def test_a_seed_that_was_trained_twice_counts_once_and_its_other_run_names_it(tmp_path):
+    a_folder(tmp_path / "first", TWO_SEEDS, started="2026-01-01T00:00:00+00:00")
+    again = [(step, [100.0]) for step, _ in TWO_SEEDS[1]]
+    a_folder(tmp_path / "again", [again], first=1, started="2026-01-02T00:00:00+00:00")
+    page = page_data(tmp_path)
+    (group,) = page["groups"]
+    assert group["seeds"] == [0, 1]
+    assert group["curves"]["sampled"]["seeds"] == [[1.5, 4.0], [100.0, 100.0]]
+    assert {run["seeds"][0]: run["elsewhere"] for run in page["runs"]} == {0: [1], 1: []}
 
 
 def test_where_every_seed_diverged_there_is_no_final_return(tmp_path):
