@@ -1,5 +1,6 @@
 """Videos, film strips and demos: every frame at its time, and no half-written file."""
 
+import dataclasses
 import fnmatch
 import os
 import pathlib
@@ -13,14 +14,16 @@ import pytest
 from PIL import Image, ImageSequence
 
 import beliefrl
-from beliefrl import tasks
+from beliefrl import play, tasks
 from beliefrl.cli import main
 from beliefrl.commands import pictures
+from beliefrl.commands.pictures import FilmOptions, PredictOptions, VideoOptions
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.restore import restore_seed
 from beliefrl.types import UserError
-from beliefrl.viewing import demo, films
-from worlds import Counter, saved
+from beliefrl.viewing import demo, films, prediction
+from inputs import same
+from worlds import Counter, CountingAgent, saved
 
 TASK = tasks.make("pendulum-p", max_steps=5)
 
@@ -53,6 +56,14 @@ def test_a_film_shows_every_step_of_every_episode(tmp_path, counted):
     played = films.video(run, tmp_path / "film.gif", fps=20.0, episodes=2, steps=4, task=task)
     assert shown(tmp_path / "film.gif") == [(time, 50) for time in (0, 1, 2, 3, 4, 0, 1, 2, 3, 4)]
     assert [episode.total for episode in played] == [10.0, 10.0]
+
+
+def test_the_episodes_of_a_film_are_those_that_play_plays(tmp_path):
+    run = saved(tmp_path / "run", "sac-mlp", TASK, seeds=2)
+    played = films.video(run, tmp_path / "film.gif", seed=5, episode_seed=7, sampled=True, episodes=2, steps=4)
+    assert len(played) == 2
+    for episode, episode_seed in zip(played, (7, 8), strict=True):
+        assert same(episode.steps, play(run, seed=5, episode_seed=episode_seed, sampled=True, steps=4).steps)
 
 
 def test_real_time_leaves_steps_out_where_they_are_too_many_a_second(tmp_path, counted):
@@ -132,6 +143,15 @@ def test_a_strip_says_that_the_numbers_below_its_frames_are_steps(run, monkeypat
     assert [text.get_text() for text in drawn[0].texts][1:] == ["step 0", "step 2", "step 5"]
 
 
+def test_a_strip_shows_the_episode_that_play_plays(tmp_path, monkeypatch):
+    run = saved(tmp_path / "run", "sac-mlp", TASK, seeds=2)
+    rows = []
+    monkeypatch.setattr(films, "_draw_strips", lambda _, made: rows.extend(made))
+    monkeypatch.setattr(films.figures, "save", lambda _, path: path)
+    films.film([run], seed=5, episode_seed=7, sampled=True, steps=4)
+    assert same(rows[0].steps, play(run, seed=5, episode_seed=7, sampled=True, steps=4).steps)
+
+
 def test_a_strip_has_a_row_for_each_run(tmp_path, run):
     other = saved(tmp_path / "other", "sac-mlp", TASK)
     heights = []
@@ -152,7 +172,7 @@ def test_frames_are_a_whole_number(run):
 @pytest.mark.slow
 def test_the_commands_write_their_files(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    saved(tmp_path / "run", "slac", TASK)
+    run = saved(tmp_path / "run", "slac", TASK)
     for line in (
         "video run film.gif --steps 2 --episodes 2 --episode-seed 7",
         "film run --frames 2 --out strip.png",
@@ -161,11 +181,41 @@ def test_the_commands_write_their_files(tmp_path, capsys, monkeypatch):
         main(line.split())
     out, err = capsys.readouterr()
     assert err == ""
-    assert "episode 8: 2 steps, return -" in out
+    for seed in (7, 8):
+        assert f"episode {seed}: 2 steps, {play(run, episode_seed=seed, steps=2).summary}\n" in out
     for line in ("film.gif", "strip.png and strip.pdf", "run/predictions.png and run/predictions.pdf"):
         assert f"written to {line}\n" in out
     names = ("film.gif", "strip.png", "strip.pdf", "run/predictions.png", "run/predictions.pdf")
     assert all((tmp_path / name).stat().st_size > 1000 for name in names)
+
+
+PLAYED = "--seed 5 --episode-seed 7 --sampled --best --agent worlds:CountingAgent"
+AS_PLAYED = {"seed": 5, "episode_seed": 7, "sampled": True, "best": True, "agent": CountingAgent}
+
+
+@pytest.mark.parametrize(
+    ("line", "options", "rest"),
+    [
+        ("video run f.gif --episodes 2 --fps 3 --steps 4", VideoOptions, {"episodes": 2, "fps": 3.0, "steps": 4}),
+        ("film run other --frames 3 --start 1 --steps 4", FilmOptions, {"frames": 3, "start": 1, "steps": 4}),
+        (
+            "predict run --model keep --start 3 --horizon 4 --samples 2 --entries 0 1",
+            PredictOptions,
+            {"model": "keep", "start": 3, "horizon": 4, "samples": 2, "entries": (0, 1)},
+        ),
+    ],
+    ids=["video", "film", "predict"],
+)
+def test_a_command_hands_on_all_of_its_options(run, monkeypatch, line, options, rest):
+    given = {}
+    monkeypatch.chdir(run.folder.parent)
+    monkeypatch.setattr(films, "video", lambda *_, **named: given.update(named) or [])
+    monkeypatch.setattr(films, "film", lambda *_, **named: given.update(named) or pathlib.Path("film.png"))
+    monkeypatch.setattr(prediction, "predictions", lambda _, **named: given.update(named))
+    monkeypatch.setattr(prediction, "draw_predictions", lambda _, path, entries: given.update(entries=entries) or path)
+    main([*line.split(), *PLAYED.split()])
+    assert given == AS_PLAYED | rest
+    assert {field.name for field in dataclasses.fields(options)} - {"run", "runs", "out"} == given.keys()
 
 
 def test_a_gif_of_a_photograph_has_the_colours_of_the_photograph():

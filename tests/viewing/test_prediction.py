@@ -141,7 +141,10 @@ def few(run, **changes):
     return beliefrl.predictions(run, **{"samples": 2, "start": 3, "horizon": 4} | changes)
 
 
-def test_a_prediction_stands_beside_the_truth_of_its_time(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("episode", "seed"), [({}, 4), ({"seed": 5, "episode_seed": 7, "sampled": True}, 5)], ids=["usual", "chosen"]
+)
+def test_a_prediction_stands_beside_the_truth_of_its_time(tmp_path, monkeypatch, episode, seed):
     """A model that copies its input makes no error in the open loop, and in the closed loop only from `start` on."""
 
     def copy(self, state, model, step, seen, key):
@@ -149,9 +152,9 @@ def test_a_prediction_stands_beside_the_truth_of_its_time(tmp_path, monkeypatch)
         return Gaussian(jnp.where(seen[:, None], x, x + 2.0), jnp.zeros_like(x))
 
     monkeypatch.setattr(SLACAgent, "predict", copy)
-    run = saved(tmp_path / "run", "slac", TASK)
-    predicted = few(run)
-    played = perception(beliefrl.play(run).steps)
+    run = saved(tmp_path / "run", "slac", TASK, seeds=2)
+    predicted = few(run, **episode)
+    played = perception(beliefrl.play(run, **episode).steps)
     np.testing.assert_allclose(predicted.truth, played[:7])
     np.testing.assert_allclose(predicted.open_loop.mean, predicted.truth)
     np.testing.assert_allclose(
@@ -161,7 +164,7 @@ def test_a_prediction_stands_beside_the_truth_of_its_time(tmp_path, monkeypatch)
     assert opened.tolist() == [0.0] * 3
     np.testing.assert_allclose(closed, 2.0)
     assert predicted.entries == (0, 1)
-    assert predicted.title == "slac on pendulum-p, seed 4: latent model"
+    assert predicted.title == f"slac on pendulum-p, seed {seed}: latent model"
 
 
 @pytest.mark.nightly
