@@ -194,12 +194,16 @@ def test_no_gradient_goes_into_the_burn_in(state):
 
 
 def test_an_update_trains_everything_and_the_targets_follow_slowly(state):
-    window = windows(jax.random.key(1), 2, TIME)
-    after, _ = jax.jit(RECURRENT.pretrain)(state, window, jax.random.key(2))
+    agent, window = dataclasses.replace(RECURRENT, tau=0.25), windows(jax.random.key(1), 2, TIME)
+    after, _ = jax.jit(agent.pretrain)(state, window, jax.random.key(2))
     assert differ(after.lstm, state.lstm)
-    expected = jax.tree.map(lambda old, new: old + RECURRENT.tau * (new - old), state.target_lstm, after.lstm)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-7), after.target_lstm, expected)
     assert differ(after.controller._replace(target_value=0), state.controller._replace(target_value=1))
+    for target, before, network in (
+        (after.target_lstm, state.target_lstm, after.lstm),
+        (after.controller.target_value, state.controller.target_value, after.controller.value),
+    ):
+        expected = jax.tree.map(lambda old, new: old + 0.25 * (new - old), before, network)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-7), target, expected)
 
 
 def test_the_critics_of_an_update_learn_from_the_target_lstm(state):
