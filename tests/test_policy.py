@@ -226,7 +226,6 @@ def test_actions_are_scaled_to_the_bounds_of_the_environment(tmp_path):
     task = GymnasiumTask(Fine)  # its action is in [-2, 6]
     run = saved(tmp_path / "run", "sac-mlp", task)
     policy = beliefrl.load(run, task=task)
-    policy.interface = task.interface
     np.testing.assert_allclose(policy.scale([[-1.0], [0.0], [0.5], [3.0]]), [[-2.0], [2.0], [4.0], [6.0]])
     np.testing.assert_allclose(policy.scale(np.array([-0.5])), [0.0])
     for wrong in ([0.1, 0.2], 0.1, [np.nan]):
