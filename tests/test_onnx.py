@@ -14,6 +14,7 @@ import pytest
 from beliefrl import cli, onnx, tasks
 from beliefrl.onnx.graph import model
 from beliefrl.policy import Policy, load
+from beliefrl.tasks.environment import TaskEnvironment
 from beliefrl.types import UserError
 from worlds import CountingAgent, begun, saved, tiny
 
@@ -101,11 +102,28 @@ def test_an_agent_whose_empty_memory_is_not_zero_begins_with_it():
 
 
 @pytest.mark.slow
-def test_the_command_compares_in_an_episode_of_the_task(tmp_path, capsys):
+def test_the_command_compares_in_an_episode_of_the_task(tmp_path, capsys, monkeypatch):
     pytest.importorskip("onnx")
+    calls = []
+
+    class Recording(TaskEnvironment):
+        def reset(self, **given):
+            calls.append("reset")
+            return super().reset(**given)
+
+        def step(self, action):
+            calls.append("step")
+            obs, reward, _, _, info = super().step(action)
+            return obs, reward, False, calls.count("step") == 9, info
+
+        def close(self):
+            calls.append("close")
+
+    monkeypatch.setattr("beliefrl.policy.TaskEnvironment", Recording)
     run = saved(tmp_path / "run", "sac-lstm", TASK)
     file = tmp_path / "policy.onnx"
     cli.main(["export", str(run.folder), str(file)])
+    assert calls == ["reset", *9 * ["step"], "close"]
     printed = capsys.readouterr().out
     assert f"written to {file}: onnxruntime reads it" in printed
     assert "largest difference from the policy: " in printed

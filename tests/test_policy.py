@@ -17,31 +17,23 @@ from beliefrl.tasks import make
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import rollout
 from beliefrl.types import UserError
-from worlds import saved
+from worlds import TINY, begun, saved, tiny
 from wrong import Fine
 
-SMALL = {
-    "vrm": {"d_size": 8, "z_size": 4, "hidden_size": 8},
-    "sac-mlp": {},
-    "sac-lstm": {"d_size": 8},
-    "predictive-sac": {"d_size": 8, "hidden_size": 8, "observation_memory": (4.0, 32.0)},
-    "slac": {"z1_size": 2, "z2_size": 4, "model_layers": (8,), "history": 3},
-}
 TASK = tasks.make("pendulum-p", max_steps=4)
 
 
-def trained(name):
+def a_state(name):
     """A small agent, and one of its states."""
-    agent = agents.make(name, policy_layers=(8,), value_layers=(8,), **SMALL[name])
-    return agent, jax.jit(lambda key: agent.init(key, TASK.spec))(jax.random.key(0))
+    return tiny(name), begun(name, TASK.spec, jax.random.key(0))
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow if name == "slac" else ()) for name in SMALL]
+    "name", [pytest.param(name, marks=pytest.mark.slow if name == "slac" else ()) for name in TINY]
 )
 def test_it_acts_as_the_agent_does_through_episodes(name):
     """Two episodes in one batch, one of which restarts while the other continues: mode actions at every step."""
-    agent, state = trained(name)
+    agent, state = a_state(name)
     policy = Policy(agent, TASK.spec, state)
     move = jax.jit(lambda actor: rollout.move(agent, TASK, state, actor, jax.random.key(1), jnp.array(False)))
     actors = [rollout.begin(agent, TASK, jax.random.key(k)) for k in (1, 2)]
@@ -70,7 +62,7 @@ def test_one_episode_is_a_batch_of_one():
 
 
 def _with_spec(name):
-    agent, state = trained(name)
+    agent, state = a_state(name)
     return agent, TASK.spec, state
 
 
@@ -141,7 +133,7 @@ def test_numbers_that_are_not_finite_are_named_and_the_state_is_as_good_as_befor
 
 
 def test_an_action_that_would_not_be_finite_is_an_error():
-    agent, state = trained("sac-mlp")
+    agent, state = a_state("sac-mlp")
     state = jax.tree.map(lambda leaf: leaf * 1e6 if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, state)
     policy = Policy(agent, TASK.spec, state)
     assert np.isfinite(policy.predict([[0.1, 0.2], [-0.1, 0.3]])[0]).all()
@@ -161,7 +153,7 @@ def test_a_reward_is_ignored_where_an_episode_begins():
 
 
 def test_what_a_policy_is_shows():
-    agent, state = trained("sac-mlp")
+    agent, state = a_state("sac-mlp")
     assert repr(Policy(agent, TASK.spec, state, 3, task="pendulum-p")) == (
         "<Policy sac-mlp on pendulum-p: observation (2,), action (1,), seed 3>"
     )
@@ -226,7 +218,6 @@ def test_actions_are_scaled_to_the_bounds_of_the_environment(tmp_path):
     task = GymnasiumTask(Fine)  # its action is in [-2, 6]
     run = saved(tmp_path / "run", "sac-mlp", task)
     policy = beliefrl.load(run, task=task)
-    policy.interface = task.interface
     np.testing.assert_allclose(policy.scale([[-1.0], [0.0], [0.5], [3.0]]), [[-2.0], [2.0], [4.0], [6.0]])
     np.testing.assert_allclose(policy.scale(np.array([-0.5])), [0.0])
     for wrong in ([0.1, 0.2], 0.1, [np.nan]):

@@ -11,7 +11,7 @@ import pytest
 from beliefrl import agents, catalogue
 from beliefrl.models.window_loss import model_loss
 from beliefrl.training import phases
-from beliefrl.types import Spec, UserError, perception
+from beliefrl.types import Spec, perception
 from inputs import SMALL, SPEC, along, random_like, same, slope, windows
 from worlds import Counting
 
@@ -123,11 +123,6 @@ def test_names_find_their_agents_and_agents_their_names():
         assert agents.name_of(agent) == name
         assert agents.make(name, **dataclasses.asdict(agent)) == agent
     assert agents.name_of(agents.make("vrm", models="single")) == "vrm-single"
-
-
-def test_unknown_models_are_refused():
-    with pytest.raises((UserError, TypeError), match="models"):
-        agents.make("vrm", models="three")
 
 
 # Tiny worlds with known values: what VRM must learn before anything else; two cannot be solved without memory.

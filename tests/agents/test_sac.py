@@ -1,4 +1,4 @@
-"""SAC-MLP: what enters no loss, units of observations. SAC-LSTM: its LSTM against numpy, gradients, beliefs in time."""
+"""SAC-MLP: what enters no loss, units of observations. SAC-LSTM: its LSTM, gradients, beliefs in time."""
 
 import dataclasses
 
@@ -9,7 +9,7 @@ import pytest
 
 from beliefrl.agents.sac_lstm import SACLSTMAgent
 from beliefrl.agents.sac_mlp import SACMLPAgent
-from beliefrl.models.nets import LSTM, draw
+from beliefrl.models.nets import LSTM, LSTMState, draw, lstm_step
 from beliefrl.models.soft_actor_critic import actor_loss, q_loss, state_value, value_loss
 from beliefrl.types import UserError
 from inputs import SPEC, along, changed_where_missing, differ, random_like, slope, windows
@@ -80,24 +80,18 @@ def state():
     return jax.jit(lambda key: RECURRENT.init(key, SPEC))(jax.random.key(0))
 
 
-def sigmoid(x):
-    return 1 / (1 + np.exp(-x))
-
-
-def test_the_lstm_is_the_textbooks():
+def test_the_lstm_goes_through_time_and_is_empty_where_an_episode_begins():
     lstm = draw(jax.random.key(0), LSTM(3, 4))
     x = np.asarray(jax.random.normal(jax.random.key(1), (5, 2, 3)))
     is_first = np.zeros((5, 2), bool)
     is_first[3, 1] = True
     ours = jax.jit(lambda: lstm.unroll(lstm.start(2), jnp.asarray(x), jnp.asarray(is_first)))()
-    d, c = np.zeros((2, 4)), np.zeros((2, 4))
+    state, (w_x, w_d, bias) = LSTMState.empty(2, 4), map(np.asarray, (lstm.w_x, lstm.w_d, lstm.bias))
     for t in range(5):
-        d, c = (np.where(is_first[t][:, None], 0.0, part) for part in (d, c))
-        i, f, g, o = np.split(x[t] @ np.asarray(lstm.w_x) + d @ np.asarray(lstm.w_d) + np.asarray(lstm.bias), 4, -1)
-        c = sigmoid(f) * c + sigmoid(i) * np.tanh(g)
-        d = sigmoid(o) * np.tanh(c)
-        np.testing.assert_allclose(ours.d[t], d, rtol=1e-4, atol=1e-6)
-        np.testing.assert_allclose(ours.c[t], c, rtol=1e-4, atol=1e-6)
+        d, c = (np.where(is_first[t][:, None], 0.0, part) for part in state)
+        state, _ = lstm_step(jnp.asarray(x[t] @ w_x + d @ w_d + bias), jnp.asarray(c))
+        for part, expected in zip(ours, state, strict=True):
+            np.testing.assert_allclose(part[t], expected, rtol=1e-4, atol=1e-6)
 
 
 def test_acting_forms_the_belief_that_replay_forms(state):
@@ -194,12 +188,16 @@ def test_no_gradient_goes_into_the_burn_in(state):
 
 
 def test_an_update_trains_everything_and_the_targets_follow_slowly(state):
-    window = windows(jax.random.key(1), 2, TIME)
-    after, _ = jax.jit(RECURRENT.pretrain)(state, window, jax.random.key(2))
+    agent, window = dataclasses.replace(RECURRENT, tau=0.25), windows(jax.random.key(1), 2, TIME)
+    after, _ = jax.jit(agent.pretrain)(state, window, jax.random.key(2))
     assert differ(after.lstm, state.lstm)
-    expected = jax.tree.map(lambda old, new: old + RECURRENT.tau * (new - old), state.target_lstm, after.lstm)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-7), after.target_lstm, expected)
     assert differ(after.controller._replace(target_value=0), state.controller._replace(target_value=1))
+    for target, before, network in (
+        (after.target_lstm, state.target_lstm, after.lstm),
+        (after.controller.target_value, state.controller.target_value, after.controller.value),
+    ):
+        expected = jax.tree.map(lambda old, new: old + 0.25 * (new - old), before, network)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-7), target, expected)
 
 
 def test_the_critics_of_an_update_learn_from_the_target_lstm(state):

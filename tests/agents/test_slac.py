@@ -162,8 +162,11 @@ def test_timesteps_that_do_not_exist_enter_no_loss(state):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), *results)
 
 
-@pytest.mark.parametrize("wrong", [{"history": 0}, {"z1_size": 0}, {"lr_model": -1.0}, {"train_interval_rl": 2}])
-def test_impossible_hyperparameters_are_refused(wrong):
+@pytest.mark.parametrize(
+    "wrong",
+    [{"history": 0}, {"z1_size": 0}, {"lr_model": -1.0}, {"train_interval_rl": 2}, {"elbo_scaling": "x"}],
+)
+def test_impossible_hyperparameters_are_refused(wrong, unchecked):
     with pytest.raises(UserError, match=f"{next(iter(wrong))}="):
         SLACAgent(**wrong)
 

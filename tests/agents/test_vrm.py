@@ -1,7 +1,7 @@
 """VRM: its tables, its gradients' reach, its beliefs in time."""
 
 import dataclasses
-from types import SimpleNamespace
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from beliefrl.agents.vrm import VRMAgent
 from beliefrl.models.scales import initial_statistics, standardise
 from beliefrl.models.variational_model import VRM
 from beliefrl.models.window_loss import draw_noise, model_loss, states
-from beliefrl.types import Timestep, UserError, Window, check_choice, perception
+from beliefrl.types import Timestep, UserError, Window, perception
 from inputs import SMALL, SPEC, differ, same
 
 AGENT = VRMAgent(**SMALL)
@@ -84,9 +84,19 @@ def test_impossible_hyperparameters_are_refused_by_name(wrong):
         agents.make("vrm", **wrong)
 
 
-def test_a_choice_that_there_is_not_is_refused_with_those_there_are():
-    with pytest.raises(UserError, match="elbo_scaling='median' is impossible: it must be mean or sum"):
-        check_choice(SimpleNamespace(elbo_scaling="median"), "elbo_scaling", ("mean", "sum"))
+@pytest.mark.parametrize(
+    ("wrong", "choices"),
+    [
+        ({"elbo_scaling": "median"}, "mean or sum"),
+        ({"decode_from": "x"}, "posterior or prior"),
+        ({"models": "three"}, "both or single or first or keep"),
+    ],
+)
+def test_a_choice_that_there_is_not_is_refused_with_those_there_are(wrong, choices, unchecked):
+    ((name, value),) = wrong.items()
+    for make in (VRMAgent, functools.partial(agents.make, "vrm")):
+        with pytest.raises(UserError, match=f"^{name}='{value}' is impossible: it must be {choices}"):
+            make(**wrong)
 
 
 def test_the_controllers_gradient_never_reaches_the_models(state):

@@ -13,11 +13,12 @@ from worlds import tiny
 
 BASES = {
     "sac-mlp": tiny("sac-mlp", batch_size=6),
+    "sac-lstm": tiny("sac-lstm", seq_len=4, batch_size=2, burn_in=2),
     "vrm": tiny("vrm", seq_len=4, batch_size=2, burn_in=2),
     "slac": tiny("slac", batch_size=2),
     "predictive-sac": tiny("predictive-sac", seq_len=6, sequences=2, pool=2, batch_size=16, observation_memory=()),
 }
-MODEL = {"vrm": "keep", "slac": "model", "predictive-sac": "model"}  # where it is in the state
+MODEL = {"sac-lstm": "lstm", "vrm": "keep", "slac": "model", "predictive-sac": "model"}  # where it is in the state
 
 
 def learned(agent, name):
@@ -43,6 +44,7 @@ def learned(agent, name):
         "targets": getattr(controller, targets),
         "alpha": controller.log_alpha,
         "model": getattr(state, MODEL[name]) if name in MODEL else (),
+        "target_model": getattr(state, "target_lstm", ()),
     }
 
 
@@ -56,10 +58,15 @@ SAC = [
     ("actor_regulariser", 1.0, "actor"),
     ("target_entropy", 50.0, "alpha"),
 ]
+LSTM = "model target_model"  # it learns from the losses of the controller
 RETURNS = "actor critics targets"  # the actor's loss is in units of the returns
 CASES = [
     *[("sac-mlp", *each) for each in SAC],
     ("sac-mlp", "gamma", 0.1, "critics"),  # V has no reward in its loss
+    ("sac-lstm", "lr_critic", 1e-2, "critics targets"),
+    ("sac-lstm", "lr_lstm", 1e-2, LSTM),
+    ("sac-lstm", "tau", 0.5, "targets target_model"),
+    ("sac-lstm", "gamma", 0.1, f"critics {LSTM}"),
     *[("predictive-sac", *each) for each in SAC],
     ("predictive-sac", "lr_model", 1e-2, "model"),
     ("predictive-sac", "gamma", 0.1, RETURNS),

@@ -1,11 +1,13 @@
 """The list of trainings in a sweep."""
 
+import dataclasses
 import json
 import shutil
 
 import pytest
 
-from beliefrl import tasks
+from beliefrl import agents, cli, tasks
+from beliefrl.runs.options import Options
 from beliefrl.runs.run import Recorder
 from beliefrl.sweeps import sources
 from beliefrl.sweeps.experiments import Experiment, grid
@@ -146,6 +148,23 @@ def test_a_training_is_a_command_that_says_everything(tmp_path):
         assert part in line
     assert training.name.endswith("-seed3")
     assert "/" not in training.name
+
+
+def test_the_command_trains_what_was_planned(tmp_path, monkeypatch):
+    hyperparameters = {"perceive_reward": False, "target_entropy": None, "policy_layers": [8], "reward_memory": (2.0,)}
+    options = {"steps": 70, "stop_at": None, "overlap": False, "track": [], "processes": "never"}
+    faults = {"flicker_flag": False, "noise": [0.1, 0.2]}
+    settings = {**hyperparameters, **options, **faults}
+    (training,) = plan([Experiment("predictive-sac", "cartpole", settings, (3,), (0, 2), {"half_length": 0.7})])
+    asked = []
+    monkeypatch.setattr("beliefrl.training.train.train", lambda *given, **more: asked.append((given, more)))
+    cli.main(training.command(tmp_path))
+    (((agent, task, out), more),) = asked
+    assert agent == agents.make("predictive-sac", **hyperparameters | {"policy_layers": (8,)})
+    assert task == tasks.make("cartpole", (0, 2), faults, half_length=0.7)
+    assert out == tmp_path / training.name
+    started = dataclasses.asdict(Options(**options | {"track": (), "seed": 3}))
+    assert more == {**started, "own_process": True, "resume": True}
 
 
 def test_names_tell_settings_apart_and_stay_short():

@@ -232,9 +232,10 @@ def test_a_preset_has_a_folder_of_its_own_and_what_is_timed_is_alone(asked):
     _, folder, options = asked[-1]
     assert str(folder) == "runs/sweep-scalability"
     assert options == {"workers": 0, "seeds_per_run": None, "ray": None}
-    experiments(asked, "--preset memory --workers 3 --ray auto --out mine")
+    experiments(asked, "--preset memory --workers 3 --seeds-per-run 2 --ray auto --out mine")
     _, folder, options = asked[-1]
-    assert (str(folder), options["workers"], options["ray"]) == ("mine", 3, "auto")
+    assert str(folder) == "mine"
+    assert options == {"workers": 3, "seeds_per_run": 2, "ray": "auto"}
 
 
 def test_a_file_and_the_command_line_go_together(asked, tmp_path):

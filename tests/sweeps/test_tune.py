@@ -319,11 +319,29 @@ def test_the_command_gives_everything_to_the_search(monkeypatch, capsys, tmp_pat
         return tuning.Tuned({"tau": 0.1}, -1.5, "beliefrl train vrm pendulum-v", tmp_path, tmp_path / "s", trials)
 
     monkeypatch.setattr(tuning, "tune", search)
-    line = "tune vrm pendulum-v --trials 7 --steps 70 --set burn_in=8 --range tau=0.1..0.5:log policy-layers=[8],[8,16]"
-    cli.main([*line.split(), "--no-prune"])
-    assert asked["ranges"] == {"tau": Range(0.1, 0.5, "log"), "policy_layers": [[8], [8, 16]]}
-    assert asked["settings"] == {"burn_in": 8, "steps": 70}
-    assert (asked["agent"], asked["trials"], asked["prune"], asked["seeds"]) == ("vrm", 7, False, 3)
+    line = (
+        "tune vrm pendulum-v --trials 7 --seeds 2 --seed 5 --steps 70 --set burn_in=8 --only tau policy_layers "
+        "--range tau=0.1..0.5:log policy-layers=[8],[8,16] --observe 0 --constants mass=2 length=0.5 --objective area "
+        f"--actions mode --no-prune --workers 3 --out {tmp_path / 'search'}"
+    )
+    cli.main(line.split())
+    assert asked == {
+        "agent": "vrm",
+        "task": "pendulum-v",
+        "trials": 7,
+        "seeds": 2,
+        "seed": 5,
+        "ranges": {"tau": Range(0.1, 0.5, "log"), "policy_layers": [[8], [8, 16]]},
+        "only": ("tau", "policy_layers"),
+        "settings": {"burn_in": 8, "steps": 70},
+        "observe": ("0",),
+        "constants": {"mass": 2, "length": 0.5},
+        "objective": "area",
+        "actions": "mode",
+        "prune": False,
+        "workers": 3,
+        "out": tmp_path / "search",
+    }
     out = capsys.readouterr().out
     assert "2 trials, 1 complete, 1 failed" in out
     assert "tau=0.1" in out

@@ -212,6 +212,7 @@ def test_names_that_cannot_be_read_are_ignored():
     assert GymnasiumTask(Broken).entry_names == ("entry 0", "entry 1")
 
 
+@pytest.mark.extra
 def test_the_robots_entries_have_the_names_of_their_joints():
     pytest.importorskip("pybullet_envs_gymnasium")
     names = tasks.entry_names(tasks.make("hopper-v"))
@@ -219,6 +220,7 @@ def test_the_robots_entries_have_the_names_of_their_joints():
     assert names[3:] == tuple(f"0.1 {joint}_joint velocity (rad/s)" for joint in ("thigh", "leg", "foot"))
 
 
+@pytest.mark.extra
 def test_mujocos_entries_have_the_names_of_their_joints():
     pytest.importorskip("mujoco")
     names = tasks.entry_names(tasks.make("gym:Hopper-v5"))

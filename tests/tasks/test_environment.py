@@ -203,6 +203,7 @@ def test_a_window_without_pygame_says_how_to_get_it(monkeypatch):
         TaskEnvironment("pendulum", "human").reset()
 
 
+@pytest.mark.extra
 @pytest.mark.filterwarnings("ignore::UserWarning:stable_baselines3")
 def test_stable_baselines_checks_and_trains_on_it():
     checker = pytest.importorskip("stable_baselines3.common.env_checker")

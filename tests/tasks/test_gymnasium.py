@@ -337,8 +337,8 @@ def test_masks_by_name_are_those_of_the_task():
     [
         ("gym:MountainCarContinuous-v0", {"observe": [0]}),
         ("gym:Pendulum-v1", {"g": 9.81, "max_episode_steps": 50}),
-        ("hopper-v", {}),
-        ("walker2d", {"observe": "positions"}),
+        pytest.param("hopper-v", {}, marks=pytest.mark.extra),
+        pytest.param("walker2d", {"observe": "positions"}, marks=pytest.mark.extra),
         ("pendulum-p", {"observe": [1]}),
         ("cartpole", {"observe": (0, 3)}),
         ("pendulum-v", {"mass": 2.0}),
@@ -410,6 +410,7 @@ def test_a_selection_of_a_selection_is_recorded_as_entries_of_the_full_observati
     assert tasks.entries(tasks.make(recorded["task"], observe=recorded["observe"])) == (2,)
 
 
+@pytest.mark.extra
 @pytest.mark.parametrize("known", catalogue.ROBOTS, ids=str)
 def test_robots_have_the_observations_of_their_masks(known):
     robot = catalogue.ROBOTS[known]
@@ -425,6 +426,7 @@ MUJOCO = {f"gym:{known.id}": known for known in catalogue.GYMNASIUMS if known.ex
 MUJOCO |= {name: robot for name, robot in catalogue.ROBOTS.items() if robot.extra == "mujoco"}
 
 
+@pytest.mark.extra
 @pytest.mark.parametrize("name", MUJOCO)
 def test_velocities_of_mujoco_are_the_simulators(name):
     pytest.importorskip("mujoco")

@@ -19,7 +19,7 @@ from beliefrl.runs.options import Options
 from beliefrl.runs.run import Run
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.pendulum import Pendulum, PendulumState
-from beliefrl.training import host_loop, initial, lockstep, phases, session
+from beliefrl.training import host_loop, initial, lockstep, phases, rounds, session
 from beliefrl.training.lockstep import Lockstep
 from beliefrl.types import UserError
 from worlds import MODELS, SEQUENCES, SHARED, Alternating, Counting, CountingAgent, CountingState, leaves, trained
@@ -82,26 +82,30 @@ def test_no_step_copies_the_replay():
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param("sac-mlp", marks=pytest.mark.slow), pytest.param("vrm", marks=pytest.mark.nightly)]
+    ("name", "envs"),
+    [
+        pytest.param("sac-mlp", 1, marks=pytest.mark.slow),
+        pytest.param("sac-mlp", 2, marks=pytest.mark.nightly),
+        pytest.param("vrm", 1, marks=pytest.mark.nightly),
+    ],
 )
-def test_the_host_loop_learns_what_the_compiled_loop_learns(name):
+def test_the_host_loop_learns_what_the_compiled_loop_learns(name, envs):
     agent, task = agents.make(name, **SHARED, **SMALL[name]), Hanging(max_steps=9)
     keys = jax.random.split(jax.random.key(0), 2)
+    stretches = {"learn": (10 * envs, 20 * envs), "cycle": rounds.round_length(agent, envs)}
+    there, log = trained(phases.compile_program(agent, task, 100, 2, envs), keys, **stretches)
     wrapped = GymnasiumTask(Wrapped, "wrapped", {"task": task})
-    there, log = trained(phases.compile_program(agent, task, 200, 2), keys, cycle=agent.cycle)
-    program = host_loop.program(agent, wrapped, 200, 2, range(2), "never")
-    here, log_here = trained(program, keys, cycle=agent.cycle)
+    program = host_loop.program(agent, wrapped, 100, 2, range(2), "never", envs=envs)
+    here, log_here = trained(program, keys, **stretches)
     program.close()
     theirs = there._replace(actor=there.actor._replace(task_state=()))
     for ours, their in zip(leaves(here), leaves(theirs), strict=True):
         np.testing.assert_allclose(ours, their, rtol=1e-3, atol=1e-4)
-    for name, values in log[-1].metrics.items():
-        np.testing.assert_allclose(log_here[-1].metrics[name], values, rtol=1e-2, atol=1e-3)
+    for metric, values in log[-1].metrics.items():
+        np.testing.assert_allclose(log_here[-1].metrics[metric], values, rtol=1e-2, atol=1e-3)
     for one, other in zip(log, log_here, strict=True):
         for ours, their in zip(*map(jax.tree.leaves, (other.episodes, one.episodes)), strict=True):
-            np.testing.assert_allclose(
-                np.asarray(ours)[other.episodes.done], np.asarray(their)[np.asarray(one.episodes.done)], rtol=1e-4
-            )
+            np.testing.assert_allclose(ours[other.episodes.done], their[one.episodes.done], rtol=1e-4)
 
 
 def test_every_window_is_unbroken_in_time():

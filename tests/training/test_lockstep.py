@@ -24,7 +24,7 @@ from beliefrl.training.schedule import Options, _processes, stages
 from beliefrl.types import StoredTimestep, Timestep, WindowShape, transitions
 from training.test_host_loop import Hanging, Wrapped
 from training.test_resume import AGENT, OPTIONS, Crash, crash_at, files
-from worlds import SHARED, Counting, CountingAgent, ReadingAgent, leaves, trained
+from worlds import SHARED, Counting, CountingAgent, ReadingAgent
 from wrong import Fine, Sleeping, Stuck, StuckClose, StuckReset, raising
 
 ENVS = 3  # with the agent's cycles of 4 steps, a round has 12
@@ -113,23 +113,6 @@ def test_environments_of_a_seed_begin_and_act_differently():
     assert len({tuple(row) for row in actions.tolist()}) == 2 * ENVS
     seed = phases.begin(CountingAgent(), tasks.make("pendulum"), 10, jax.random.key(0), ENVS)
     assert len({tuple(row) for row in np.asarray(seed.actor.step.obs).tolist()}) == ENVS
-
-
-@pytest.mark.nightly
-def test_the_host_loop_learns_what_the_compiled_loop_learns():
-    agent = agents.make("sac-mlp", **SHARED, batch_size=8, pretrain_updates=10)
-    task, keys = Hanging(max_steps=9), jax.random.split(jax.random.key(0), 2)
-    stretches = {"learn": (20, 40), "cuts": (10, 10), "cycle": rounds.round_length(agent, 2)}
-    there, log = trained(phases.compile_program(agent, task, 100, 2, 2), keys, **stretches)
-    wrapped = GymnasiumTask(Wrapped, "wrapped", {"task": task})
-    program = host_loop.program(agent, wrapped, 100, 2, range(2), "never", envs=2)
-    here, log_here = trained(program, keys, **stretches)
-    program.close()
-    theirs = there._replace(actor=there.actor._replace(task_state=()))
-    for ours, their in zip(leaves(here), leaves(theirs), strict=True):
-        np.testing.assert_allclose(ours, their, rtol=1e-3, atol=1e-4)
-    for one, other in zip(log, log_here, strict=True):
-        assert one.episodes.done[:, : other.episodes.done.shape[1]].tolist() == other.episodes.done.tolist()
 
 
 @pytest.mark.slow

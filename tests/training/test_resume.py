@@ -27,7 +27,7 @@ from beliefrl.training import session
 from beliefrl.training.schedule import Phase
 from beliefrl.training.stop import Stopped
 from beliefrl.types import UserError
-from worlds import saved
+from worlds import Counting, CountingAgent, saved
 from wrong import Fine, Raising
 
 SIZES = {"policy_layers": (8,), "value_layers": (8,), "batch_size": 8, "standardise": True}
@@ -438,6 +438,32 @@ def test_a_callback_stops_a_training_that_goes_on_to_the_last_bit(whole, tmp_pat
     assert not is_finished(run)
     resume(run, callback=lambda event: "only True stops it", report=lambda event: True)
     assert files(run.folder) == files(whole[0])
+
+
+@pytest.mark.parametrize(("line", "patience", "end"), [(28.0, 1, 10), (29.0, 1, 30), (28.0, 2, 20)])
+def test_a_training_ends_at_the_evaluation_that_reaches_the_line(tmp_path, line, patience, end):
+    """Every return is 28."""
+    options = {"steps": 30, "eval_every": 10, "eval_episodes": 1, "stop_at": line, "stop_patience": patience}
+    run = train(CountingAgent(step_start_rl=30), Counting(), tmp_path / "run", **options)
+    assert run.results()["step"] == end
+
+
+@pytest.mark.parametrize(
+    ("line", "changes"),
+    [
+        ("", {}),
+        ("--step-timeout same --stop-at same", {}),
+        ("--step-timeout None --stop-at None", {"step_timeout": None, "stop_at": None}),
+        ("--step-timeout 5", {"step_timeout": 5.0}),
+        ("--steps 300 --stop-at -20 --stop-patience 2", {"steps": 300, "stop_at": -20.0, "stop_patience": 2}),
+    ],
+)
+def test_a_resumed_training_gets_the_options_that_change(tmp_path, monkeypatch, line, changes):
+    run, asked = saved(tmp_path / "run", "sac-mlp", make("pendulum")), []
+    monkeypatch.setattr("beliefrl.training.train._go_on", lambda run, changes, *_: asked.append(changes) or run)
+    resume(run, **changes)
+    main(["resume", str(run.folder), *line.split()])
+    assert asked == [changes, changes]
 
 
 @pytest.mark.nightly

@@ -1,9 +1,12 @@
 """The order of the phases, as their events show it: first networks, notes after the pre-training, evaluations."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+from beliefrl import tasks
 from beliefrl.runs.options import Options
+from beliefrl.training import keys
 from beliefrl.training.schedule import stages
 from worlds import Alternating, Counting, CountingAgent
 
@@ -18,6 +21,20 @@ class Drawn(CountingAgent):
 
     def init(self, key, spec):
         return super().init(key, spec)._replace(offset=jax.random.normal(key))
+
+
+def test_no_two_purposes_and_no_two_steps_have_one_key():
+    purposes = keys.ACT, keys.UPDATE, keys.SAMPLE, keys.CYCLE, keys.PRETRAIN, keys.REFRESH, keys.EVALUATE, keys.REVIVE
+    made = [keys.step_key(jax.random.key(3), jnp.array(step), each) for each in purposes for step in (0, 1, 7)]
+    assert len({tuple(jax.random.key_data(key).tolist()) for key in made}) == 3 * len(purposes)
+
+
+def test_every_evaluation_plays_episodes_of_its_own():
+    """The agent does not change, and the task begins at random."""
+    task = tasks.make("pendulum", max_steps=7)
+    found = [event.evaluation for event in events(CountingAgent(), task, steps=14) if event.evaluation is not None]
+    returns = [float(total) for evaluation in found for total in evaluation.episode_return.ravel()]
+    assert len(set(returns)) == len(returns) == 4
 
 
 def test_seeds_begin_with_networks_of_their_numbers():

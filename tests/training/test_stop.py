@@ -210,6 +210,7 @@ def test_a_second_interrupt_does_not_end_an_interactive_session():
     assert "beliefrl: stopped at once" in done.stderr
 
 
+@pytest.mark.extra
 def test_a_notebook_shows_the_sentence():
     from beliefrl.training.stop import Stopped
 

@@ -73,6 +73,7 @@ def test_real_time_leaves_steps_out_where_they_are_too_many_a_second(tmp_path, c
     assert shown(tmp_path / "film.gif") == [(time, 20) for time in (0, 3, 6, 9)]
 
 
+@pytest.mark.extra
 def test_an_mp4_is_as_long_as_the_episode(tmp_path, run):
     ffmpeg = pytest.importorskip("imageio_ffmpeg").get_ffmpeg_exe()
     beliefrl.video(run, tmp_path / "film.mp4")  # a step takes a twentieth of a second
@@ -97,7 +98,7 @@ class Growing(Counter):
 
 
 @pytest.mark.parametrize(("make", "sentence"), [(Failing, "the battery is empty"), (Growing, "of different sizes")])
-@pytest.mark.parametrize("ending", ["gif", "mp4"])
+@pytest.mark.parametrize("ending", ["gif", pytest.param("mp4", marks=pytest.mark.extra)])
 def test_a_film_that_fails_leaves_the_old_one(tmp_path, counted, make, sentence, ending):
     if ending == "mp4":
         pytest.importorskip("imageio_ffmpeg")
