@@ -4,6 +4,7 @@ import functools
 import pathlib
 import re
 import sys
+import types
 
 import jax
 import jax.export
@@ -148,6 +149,43 @@ def test_a_model_that_differs_is_not_written(tmp_path, monkeypatch):
     with pytest.raises(UserError, match=r"The ONNX model differs from the policy by .*, more than 1e-05"):
         policy.export(tmp_path / "policy.onnx")
     assert not list(tmp_path.iterdir())
+
+
+class Runtime:
+    """An onnxruntime whose models give NaN, or which runs none."""
+
+    SessionOptions = types.SimpleNamespace
+
+    def __init__(self, runs=True):
+        self.runs = runs
+
+    def InferenceSession(self, content, options, providers):
+        if not self.runs:
+            raise RuntimeError("[ONNXRuntimeError] : 9 : NOT_IMPLEMENTED : Scan\n")
+        return self
+
+    def get_inputs(self):
+        return [types.SimpleNamespace(name="obs")]
+
+    def run(self, outputs, given):
+        return [np.full((1, 1), np.nan, np.float32)] * 2
+
+
+def test_a_model_that_gives_nan_is_not_written(tmp_path, monkeypatch):
+    pytest.importorskip("onnx")
+    monkeypatch.setitem(sys.modules, "onnxruntime", Runtime())
+    with pytest.raises(UserError, match="The ONNX model differs from the policy by nan"):
+        a_policy("sac-mlp").export(tmp_path / "policy.onnx")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_model_that_does_not_run_is_one_sentence_and_no_environment_is_made(monkeypatch):
+    pytest.importorskip("onnx")
+    monkeypatch.setitem(sys.modules, "onnxruntime", Runtime(runs=False))
+    made = []
+    with pytest.raises(UserError, match=r"cannot run the model \(RuntimeError: .*Scan\): export the policy as a .jax"):
+        onnx.export(a_policy("sac-mlp"), lambda: made.append("an environment"))
+    assert not made
 
 
 def test_an_operation_that_is_not_supported_is_named():
