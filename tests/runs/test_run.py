@@ -16,7 +16,7 @@ import pytest
 import beliefrl
 from beliefrl.runs import best, records
 from beliefrl.runs.arrays import write_whole
-from beliefrl.runs.folder import free_folder
+from beliefrl.runs.folder import folder_name, free_folder
 from beliefrl.runs.options import Options
 from beliefrl.runs.records import provenance
 from beliefrl.runs.run import Recorder, Run
@@ -362,6 +362,10 @@ def test_free_folder_takes_the_first_free_number(tmp_path):
     (tmp_path / "vrm-pendulum-3").mkdir()
     assert free_folder("vrm-pendulum", parent) == tmp_path / "vrm-pendulum-2"
     assert free_folder("v" * 300, parent) == tmp_path / ("v" * 300 + "-1")  # `Recorder` says that this is too long
+
+
+def test_special_characters_in_the_name_of_a_folder_become_dashes():
+    assert folder_name("m:Own-gym:a/B-v0-tau=0.1,0.2") == "m-Own-gym-a-B-v0-tau=0.1,0.2"
 
 
 def test_provenance_says_what_a_run_was_made_with():

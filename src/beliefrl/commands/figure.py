@@ -65,7 +65,7 @@ def figure(argv: Sequence[str]) -> None:
     out = options.out or pathlib.Path(kind)
     path, more = _draw(kind, runs, out, options.actions)
     if kind in TABLES:
-        print(path.read_text(), end="")
+        print(path.read_text(encoding="utf-8"), end="")
     for note in notes + more:
         print(note)
     print(f"written to {path} and {path.with_suffix('.tex' if kind in TABLES else '.pdf').name}")
