@@ -132,7 +132,8 @@ def extended(
                 own = {name: training.options[name] for name in ("seed", "seeds")}
                 trainings[training.name] = dataclasses.replace(training, options=like.options | own)
                 present |= set(training.seeds)
-        added.append(dataclasses.replace(experiment, seeds=tuple(set(experiment.seeds) - present)))
+        if left := set(experiment.seeds) - present:
+            added.append(dataclasses.replace(experiment, seeds=tuple(left)))
     _check(trainings.values())
     new = plan(added, seeds_per_run)
     for name in (each.name for each in new if each.name in trainings):

@@ -168,7 +168,7 @@ def _check_options(folder: pathlib.Path, trainings: Sequence[Training]) -> None:
         for name, value in dataclasses.asdict(plans.options_of(training)).items():
             if name not in (*CHANGEABLE, *OF_A_RUN) and plain(there[name]) != plain(value):
                 raise UserError(
-                    f"{run.folder} was trained with {name}={there[name]}, not {value}: give that value, or choose "
+                    f"{run.shown} was trained with {name}={there[name]}, not {value}: give that value, or choose "
                     "another --out, in Python out=."
                 )
 
