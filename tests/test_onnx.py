@@ -1,6 +1,7 @@
 """A policy as an ONNX model: it acts like the policy in onnxruntime, for any batch size."""
 
 import functools
+import os
 import pathlib
 import re
 import sys
@@ -140,6 +141,16 @@ def test_a_missing_package_is_one_sentence(tmp_path, monkeypatch):
     with pytest.raises(UserError, match=r"not installed: pip install 'beliefrl\[onnx\]'"):
         a_policy("sac-mlp").export(tmp_path / "policy.onnx")
     assert not list(tmp_path.iterdir())
+
+
+def test_an_environment_that_changes_the_working_directory_does_not_move_the_model(tmp_path, monkeypatch):
+    pytest.importorskip("onnx")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path)
+    policy = a_policy("sac-mlp")
+    policy.environment = lambda: os.chdir("elsewhere")
+    policy.export("policy.onnx")
+    assert (tmp_path / "policy.onnx").exists()
 
 
 def test_a_model_that_differs_is_not_written(tmp_path, monkeypatch):

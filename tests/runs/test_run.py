@@ -364,6 +364,24 @@ def test_free_folder_takes_the_first_free_number(tmp_path):
     assert free_folder("v" * 300, parent) == tmp_path / ("v" * 300 + "-1")  # `Recorder` says that this is too long
 
 
+def test_a_damaged_file_of_agents_is_set_aside_where_a_seed_keeps_its_agent(recorder):
+    path = recorder.folder / "agent.safetensors"
+    path.write_bytes(b"nonsense")
+    recorder.save({"w": jnp.arange(2.0)}, but=[0], step=7)
+    assert (recorder.folder / "damaged-agent.safetensors").read_bytes() == b"nonsense"
+    np.testing.assert_array_equal(Run(recorder.folder).load({"w": jnp.zeros(2)})["w"], [0.0, 1.0])
+
+
+def test_a_run_is_where_it_was_opened_and_is_called_as_it_was_given(recorder, monkeypatch):
+    monkeypatch.chdir(recorder.folder.parent)
+    run = Run("run")
+    recorder.log(3, "update", 5, {"loss": 0.5})
+    monkeypatch.chdir("/")
+    assert [row["step"] for row in run.rows(3)] == [5]
+    assert run.folder == recorder.folder
+    assert (run.shown, repr(run)) == ("run", "<Run run: vrm on pendulum-v>")
+
+
 def test_special_characters_in_the_name_of_a_folder_become_dashes():
     assert folder_name("m:Own-gym:a/B-v0-tau=0.1,0.2") == "m-Own-gym-a-B-v0-tau=0.1,0.2"
 

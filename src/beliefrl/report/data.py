@@ -116,7 +116,7 @@ def _run(run: Run, page_folder: pathlib.Path, groups_of: Sequence[int | None]) -
     config = run.config
     steps = {seed: last_step(run, seed) for seed in run.seeds}
     return {
-        "folder": str(run.folder),
+        "folder": run.shown,
         "agent": config["agent"],
         "task": task_label(run),
         "group": next((index for index in groups_of if index is not None), None),

@@ -7,6 +7,7 @@ import os
 import pathlib
 import platform
 import re
+import shlex
 import shutil
 from typing import Any
 
@@ -48,7 +49,8 @@ def clear(folder: pathlib.Path) -> None:
     inside = [path.relative_to(folder).as_posix() for path in folder.rglob("*")]
     is_run = _is_of_training(folder)
     if not all(re.fullmatch(UNSAVED if is_run else MAKING, name) for name in inside):
-        go_on, in_python = (f", or `beliefrl resume {folder}`", " or resume=True") if is_run else ("", "")
+        command = f"beliefrl resume {shlex.quote(str(folder))}"
+        go_on, in_python = (f", or `{command}`", " or resume=True") if is_run else ("", "")
         raise UserError(f"{folder} exists already: choose another --out{go_on}; in Python out={in_python}.")
     if not inside:
         return
