@@ -14,7 +14,6 @@ import json
 import os
 import statistics
 import subprocess
-import sys
 import tempfile
 import time
 
@@ -25,6 +24,7 @@ import tyro
 from gymnasium import spaces
 
 from beliefrl import agents, train
+from beliefrl.sweeps.places import worker
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import host_loop as loop
 from beliefrl.training import phases
@@ -211,7 +211,7 @@ SIZES = ("--obs", "1", "--actions", "1", "--json")
 
 def begin(core: str, agent: str, seeds: int = 1) -> subprocess.Popen[str]:
     """Start a benchmark in a process of its own, on one core, or on all of them (-)."""
-    command = [sys.executable, "-m", "beliefrl.worker", core, "bench", agent, *SIZES, "--seeds", str(seeds)]
+    command = worker(core, ["bench", agent, *SIZES, "--seeds", str(seeds)])
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
 
 

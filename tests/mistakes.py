@@ -284,7 +284,6 @@ MISTAKES = {
     "show": "RUN is missing",
     "show missing": "no run folder missing",
     "show broken": "broken/config.json cannot be read",
-    "show foreign": "no agent 'foreign'",
     "show list": "list/config.json lacks",
     "show crowded": "crowded/config.json cannot be used: seeds=1000000000 is impossible",
     "show misshapen": "misshapen/results.json is damaged",

@@ -6,6 +6,7 @@ import importlib
 import importlib.metadata
 import json
 import os
+import subprocess
 import sys
 from typing import Annotated, Literal
 
@@ -122,12 +123,53 @@ def test_a_parent_that_cannot_be_written_to_is_a_mistake(folders, capsys):
     assert "cannot be made" in complaint(capsys, [*TRAIN.split(), "--out", "there/run"])
 
 
-def test_too_little_memory_is_said_in_one_sentence(folders, capsys, monkeypatch):
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes")])
+def test_too_little_memory_is_said_in_one_sentence(folders, capsys, monkeypatch, error):
     def fail(*_, **__):
-        raise MemoryError
+        raise error
 
     monkeypatch.setattr("beliefrl.training.phases.compile_program", fail)
     assert "not enough memory" in complaint(capsys, [*TRAIN.split(), "--out", "run"])
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("line", ["agents", "--version", "train vrm --help"])
+def test_a_reader_that_closes_the_pipe_is_no_error(line, unbuffered):
+    reads, writes = os.pipe()
+    os.close(reads)
+    command = [sys.executable, "-m", "beliefrl.cli", *line.split()]
+    env = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
+    found = subprocess.run(command, stdout=writes, stderr=subprocess.PIPE, text=True, env=env)
+    os.close(writes)
+    assert (found.returncode, found.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("name", "shown", "why"),
+    [
+        ("foreign", "foreign", "There is no agent 'foreign'"),
+        ("overset", "colour=1", "no hyperparameter 'colour'"),
+    ],
+)
+def test_a_run_of_another_version_is_shown(folders, capsys, name, shown, why):
+    cli.main(["show", name])
+    out, err = capsys.readouterr()
+    table, _, notes = out.rpartition("└")
+    assert shown in table
+    assert why in notes
+    assert err == ""
+
+
+def test_an_environment_that_changes_the_working_directory_does_not_move_a_picture(folders, capsys, monkeypatch):
+    def moves(*_, **__):
+        os.chdir("there")
+
+    written = []
+    monkeypatch.setattr("beliefrl.viewing.prediction.predictions", moves)
+    monkeypatch.setattr("beliefrl.viewing.prediction.draw_predictions", lambda _, path, __: written.append(path))
+    cli.main(["predict", "untrained", "--out", "picture.png"])
+    assert written == [folders / "picture.png"]
+    assert capsys.readouterr().out == "written to picture.png and picture.pdf\n"
 
 
 # How values on the command line are parsed, and shown in the help.
@@ -287,7 +329,7 @@ def test_a_sweep_trains_it_by_its_name(folder):
 def test_a_sweep_goes_on_only_where_it_is_named_again(recorded, capsys):
     whole = {"name": "a", "agent": "trap:Agent", "task": "pendulum", "settings": {}, "options": {}, "observe": []}
     (recorded / "sweep").mkdir()
-    (recorded / "sweep" / "sweep.json").write_text(json.dumps({"trainings": [whole]}))
+    (recorded / "sweep" / "sweep.json").write_text(json.dumps({"format": 1, "trainings": [whole]}))
     assert "sweep trains trap:Agent: name that agent again" in complaint(capsys, ["sweep", "--out", "sweep"])
     with pytest.raises(UserError, match="sweep trains trap:Agent"):
         sweep(grid(["vrm"], ["pendulum"]), "sweep")

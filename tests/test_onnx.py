@@ -1,9 +1,11 @@
 """A policy as an ONNX model: it acts like the policy in onnxruntime, for any batch size."""
 
 import functools
+import os
 import pathlib
 import re
 import sys
+import types
 
 import jax
 import jax.export
@@ -159,6 +161,16 @@ def test_a_missing_package_is_one_sentence(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+def test_an_environment_that_changes_the_working_directory_does_not_move_the_model(tmp_path, monkeypatch):
+    pytest.importorskip("onnx")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path)
+    policy = a_policy("sac-mlp")
+    policy.environment = lambda: os.chdir("elsewhere")
+    policy.export("policy.onnx")
+    assert (tmp_path / "policy.onnx").exists()
+
+
 def test_a_model_that_differs_is_not_written(tmp_path, monkeypatch):
     pytest.importorskip("onnx")
     policy = a_policy("sac-mlp")
@@ -166,6 +178,43 @@ def test_a_model_that_differs_is_not_written(tmp_path, monkeypatch):
     with pytest.raises(UserError, match=r"The ONNX model differs from the policy by .*, more than 1e-05"):
         policy.export(tmp_path / "policy.onnx")
     assert not list(tmp_path.iterdir())
+
+
+class Runtime:
+    """An onnxruntime whose models give NaN, or which runs none."""
+
+    SessionOptions = types.SimpleNamespace
+
+    def __init__(self, runs=True):
+        self.runs = runs
+
+    def InferenceSession(self, content, options, providers):
+        if not self.runs:
+            raise RuntimeError("[ONNXRuntimeError] : 9 : NOT_IMPLEMENTED : Scan\n")
+        return self
+
+    def get_inputs(self):
+        return [types.SimpleNamespace(name="obs")]
+
+    def run(self, outputs, given):
+        return [np.full((1, 1), np.nan, np.float32)] * 2
+
+
+def test_a_model_that_gives_nan_is_not_written(tmp_path, monkeypatch):
+    pytest.importorskip("onnx")
+    monkeypatch.setitem(sys.modules, "onnxruntime", Runtime())
+    with pytest.raises(UserError, match="The ONNX model differs from the policy by nan"):
+        a_policy("sac-mlp").export(tmp_path / "policy.onnx")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_model_that_does_not_run_is_one_sentence_and_no_environment_is_made(monkeypatch):
+    pytest.importorskip("onnx")
+    monkeypatch.setitem(sys.modules, "onnxruntime", Runtime(runs=False))
+    made = []
+    with pytest.raises(UserError, match=r"cannot run the model \(RuntimeError: .*Scan\): export the policy as a .jax"):
+        onnx.export(a_policy("sac-mlp"), lambda: made.append("an environment"))
+    assert not made
 
 
 def test_an_operation_that_is_not_supported_is_named():

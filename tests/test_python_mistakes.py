@@ -22,7 +22,7 @@ MISTAKES = {
     "Experiment(3, 'pendulum')": "agent=3 is impossible: give its name.",
     "Experiment('vrm', 'pendulum', [1])": "settings=[1] is impossible: give a dictionary",
     "Experiment('vrm', 'pendulum', observe=2.5)": "observe=2.5 is impossible: give entries of the observation.",
-    "Experiment('vrm', 'pendulum', seeds='01')": "seeds=01 is impossible: give the seed numbers",
+    "Experiment('vrm', 'pendulum', seeds='01')": "seeds='01' is impossible: give the seed numbers",
     "grid('vrm', 'pendulum', [0.9])": "settings=[0.9] is impossible: give a dictionary",
     "sweep([Experiment('vrm', 'pendulum')], 'out', ray=3)": "ray=3 is impossible: give HOST:PORT",
     "sweep([Experiment('vrm', 'pendulum')], 3)": "3 is no path: give a text or a pathlib.Path.",

@@ -1,5 +1,6 @@
 """The command line: finds the command, shows help, and turns errors into exit codes."""
 
+import os
 import sys
 from collections.abc import Sequence
 from typing import NoReturn
@@ -49,13 +50,29 @@ and exit code 2.
 
 
 def _fail(message: str) -> NoReturn:
-    print("beliefrl:", " ".join(message.split()), file=sys.stderr)
+    print("beliefrl:", message, file=sys.stderr)
     raise SystemExit(2)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """The program `beliefrl`. Exits with 2 and one sentence on a UserError."""
-    argv = sys.argv[1:] if argv is None else argv
+    try:
+        _run(sys.argv[1:] if argv is None else argv)
+    except BrokenPipeError:  # the reader of the output has closed it
+        raise SystemExit(0) from None
+    finally:
+        _flush()
+
+
+def _flush() -> None:
+    """Write what is buffered, or drop it if its reader has closed the pipe: Python would complain when it ends."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _run(argv: Sequence[str]) -> None:
     if not argv or argv[0] in ("-h", "--help", "help"):
         print(HELP, end="")
         return
@@ -81,8 +98,6 @@ def main(argv: Sequence[str] | None = None) -> None:
         what = str(stopped) or "stopped; what was logged and saved until now is kept."
         print(f"beliefrl: {what}", file=sys.stderr)
         raise SystemExit(getattr(stopped, "exit_code", 130)) from None
-    except BrokenPipeError:
-        raise SystemExit(0) from None
     except Exception as error:
         if isinstance(error, MemoryError | OverflowError) or "out of memory" in str(error).lower():
             _fail("There is not enough memory for this: lower the sizes, the seeds, the episodes or the replay.")

@@ -231,6 +231,7 @@ class Policy:
         """
         path = pathlib.Path(path)
         check_folder(path)
+        place = path.absolute()  # an environment may change the working directory
         if os.path.exists(path) and not overwrite:  # noqa: PTH110 - pathlib's raises where it may not look
             raise UserError(f"{path} exists already: choose another file, or replace it with overwrite (--overwrite).")
         if path.suffix.lower() == ".onnx":
@@ -239,7 +240,7 @@ class Policy:
             content, difference = onnx.export(in_float32, self.environment)
         else:
             content, difference = self._for_jax(), None
-        write_given(path, content)
+        write_given(place, content)
         return difference
 
     def _for_jax(self) -> bytes:

@@ -1,6 +1,6 @@
-"""One training of a sweep in a process of its own: `python -m beliefrl.worker [CORE] train ...`.
+"""One training of a sweep in a process of its own: `python -m beliefrl.worker PARENT CORE train ...`.
 
-It runs the command line's `train` on one core, and stops (with a checkpoint) if its parent process dies.
+It runs the command line's `train` on one core. On Linux it stops, with a checkpoint, if its parent process dies.
 """
 
 import ctypes
@@ -12,14 +12,13 @@ STOP_WITH_PARENT = 1  # prctl's PR_SET_PDEATHSIG
 
 
 def main(argv: list[str]) -> None:
-    """Train on the core that is named first; `-` is any core."""
-    parent = os.getppid()
-    core, *command = argv
+    """Train for the process PARENT, on the core CORE; `-` is any core."""
+    parent, core, *command = argv
     if core != "-":
         os.sched_setaffinity(0, {int(core)})  # before XLA counts the cores
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(STOP_WITH_PARENT, signal.SIGTERM)
-        if os.getppid() != parent:
+        if os.getppid() != int(parent):  # it has died already
             raise SystemExit(128 + signal.SIGTERM)
     sys.argv = ["beliefrl", *command]  # recorded in the run's config
     from beliefrl import cli

@@ -11,7 +11,7 @@ from scipy.stats import t as student
 
 from beliefrl import catalogue
 from beliefrl.analysis.panels import AGENTS, colours
-from beliefrl.report import write_report
+from beliefrl.report import data, write_report
 from beliefrl.report.data import statistics
 from beliefrl.types import UserError
 from inputs import EVIL, HOUR, TWO_SEEDS, a_folder
@@ -161,6 +161,16 @@ def test_settings_are_those_that_differ_from_the_agents(tmp_path):
     a_folder(tmp_path / "b", TWO_SEEDS, agent="vrm-single", hyperparameters={"models": "single"})
     a_folder(tmp_path / "c", TWO_SEEDS, agent="mine:Agent", hyperparameters={"x": 1})
     assert [run["settings"] for run in page_data(tmp_path)["runs"]] == [["d_size=7"], [], None]
+
+
+def test_a_picture_on_another_drive_has_an_absolute_address(tmp_path, monkeypatch):
+    """Windows has no relative path from one drive to another."""
+
+    def refuse(*_):
+        raise ValueError("path is on mount 'D:', start on mount 'C:'")
+
+    monkeypatch.setattr(data.os.path, "relpath", refuse)
+    assert data._link(tmp_path, tmp_path / "a b.gif") == {"name": "a b.gif", "address": f"file://{tmp_path}/a%20b.gif"}
 
 
 def test_videos_and_curves_are_linked_from_where_the_page_lies(tmp_path):

@@ -12,7 +12,7 @@ import pytest
 
 from beliefrl import Options, UserError, resume
 from beliefrl.runs import arrays, best, trackers
-from beliefrl.runs.folder import locked, make
+from beliefrl.runs.folder import is_locked, locked, make
 from beliefrl.runs.run import Recorder
 from inputs import a_run, flat
 
@@ -285,6 +285,15 @@ def test_weights_and_biases_is_kept_offline_in_the_runs_folder(tmp_path):
     assert all(b"evaluation/sampled" in content for content in contents)
     assert all(len(content) > 100 for content in contents)
     assert not (tmp_path / "wandb").exists()
+
+
+def test_whether_a_folder_is_locked_can_be_asked(tmp_path):
+    assert not is_locked(tmp_path / "missing")
+    assert not is_locked(tmp_path)
+    with locked(tmp_path, "is in use"):
+        assert is_locked(tmp_path)
+        assert (tmp_path / "lock").read_text()  # it still says who has locked it
+    assert not is_locked(tmp_path)
 
 
 def test_a_file_system_without_locks_is_no_error(tmp_path, monkeypatch):

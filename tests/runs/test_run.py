@@ -16,15 +16,17 @@ import pytest
 import beliefrl
 from beliefrl.runs import best, records
 from beliefrl.runs.arrays import write_whole
-from beliefrl.runs.folder import free_folder
+from beliefrl.runs.folder import folder_name, free_folder
 from beliefrl.runs.options import Options
 from beliefrl.runs.records import provenance
 from beliefrl.runs.run import Recorder, Run
 from beliefrl.training import log
+from beliefrl.training.restore import as_argument
 from beliefrl.training.rollout import Episode
 from beliefrl.training.schedule import Event, Phase
 from beliefrl.training.summary import summary
 from beliefrl.types import UserError
+from inputs import a_run, flat
 
 CONFIG = {
     "agent": "vrm",
@@ -210,6 +212,7 @@ import json, pathlib, sys
 from beliefrl.training.restore import agent_of
 from beliefrl.runs.run import Run
 from beliefrl.training.summary import summary
+from beliefrl.training.restore import as_argument
 from beliefrl.training.rollout import Episode
 from beliefrl.types import UserError
 config = json.loads(pathlib.Path("config.json").read_text())
@@ -362,6 +365,39 @@ def test_free_folder_takes_the_first_free_number(tmp_path):
     (tmp_path / "vrm-pendulum-3").mkdir()
     assert free_folder("vrm-pendulum", parent) == tmp_path / "vrm-pendulum-2"
     assert free_folder("v" * 300, parent) == tmp_path / ("v" * 300 + "-1")  # `Recorder` says that this is too long
+
+
+def test_a_damaged_file_of_agents_is_set_aside_where_a_seed_keeps_its_agent(recorder):
+    path = recorder.folder / "agent.safetensors"
+    path.write_bytes(b"nonsense")
+    recorder.save({"w": jnp.arange(2.0)}, but=[0], step=7)
+    assert (recorder.folder / "damaged-agent.safetensors").read_bytes() == b"nonsense"
+    np.testing.assert_array_equal(Run(recorder.folder).load({"w": jnp.zeros(2)})["w"], [0.0, 1.0])
+
+
+def test_a_folder_with_a_space_is_quoted_in_the_commands_of_messages(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run = a_run(tmp_path / "my run", [flat(1.0)])
+    assert as_argument(Run("my run")) == "'my run'"
+    run.config["agent"] = "module:Agent"
+    assert as_argument(run) == f"'{run.folder}' --agent module:Agent"
+    (run.folder / "agent.safetensors").write_bytes(b"")
+    with pytest.raises(UserError, match=r"or `beliefrl resume 'my run'`; in Python"):
+        Recorder("my run", CONFIG)
+
+
+def test_a_run_is_where_it_was_opened_and_is_called_as_it_was_given(recorder, monkeypatch):
+    monkeypatch.chdir(recorder.folder.parent)
+    run = Run("run")
+    recorder.log(3, "update", 5, {"loss": 0.5})
+    monkeypatch.chdir("/")
+    assert [row["step"] for row in run.rows(3)] == [5]
+    assert run.folder == recorder.folder
+    assert (run.shown, repr(run)) == ("run", "<Run run: vrm on pendulum-v>")
+
+
+def test_special_characters_in_the_name_of_a_folder_become_dashes():
+    assert folder_name("m:Own-gym:a/B-v0-tau=0.1,0.2") == "m-Own-gym-a-B-v0-tau=0.1,0.2"
 
 
 def test_provenance_says_what_a_run_was_made_with():

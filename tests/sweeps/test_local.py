@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -56,7 +57,7 @@ def test_the_reason_of_a_failure_is_not_that_of_an_earlier_session(tmp_path):
         with places.open_log(path) as log:
             log.write(said.encode())
     assert "stopped at step 10" in path.read_text()
-    assert reason(path, -9) == "it ended with code -9 and printed nothing"
+    assert reason(path, 1) == "it ended with code 1 and printed nothing"
     with places.open_log(path) as log:
         log.write(b"Traceback\nValueError: odd\n")
     assert reason(path, 1) == "ValueError: odd"
@@ -65,9 +66,26 @@ def test_the_reason_of_a_failure_is_not_that_of_an_earlier_session(tmp_path):
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="This system cannot choose cores.")
 def test_a_worker_runs_on_its_core():
     core = max(os.sched_getaffinity(0))
-    code = f"import os, beliefrl.worker as w; w.main(['{core}', '--version']); print(os.sched_getaffinity(0))"
+    argv = [str(os.getpid()), str(core), "--version"]
+    code = f"import os, beliefrl.worker as w; w.main({argv}); print(os.sched_getaffinity(0))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert out.splitlines()[-1] == f"{{{core}}}"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="Only Linux tells a process that its parent has died.")
+def test_a_worker_whose_parent_has_died_before_it_began_ends():
+    command = [sys.executable, "-m", "beliefrl.worker", "0", "-", "--version"]  # process 0 is not its parent
+    found = subprocess.run(command, capture_output=True, text=True)
+    assert (found.returncode, found.stdout) == (128 + signal.SIGTERM, "")
+
+
+def test_a_cluster_that_has_shrunk_has_no_room():
+    cluster = places.Cluster.__new__(places.Cluster)
+    cluster._ray = SimpleNamespace(cluster_resources=lambda: {"CPU": 2})
+    cluster.has_gpus, cluster._workers = False, None
+    for running, room in ((1, 1), (3, 0)):
+        cluster._running = dict.fromkeys(range(running))
+        assert cluster.room == room
 
 
 def test_there_is_a_slot_for_each_core_and_no_more_than_asked_for(monkeypatch):

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import shutil
 
+import numpy as np
 import pytest
 
 from beliefrl import agents, cli, tasks
@@ -40,6 +41,43 @@ def test_faults_of_the_sensors_are_settings(tmp_path):
     assert extended(read(tmp_path), noisy) == read(tmp_path)
     with pytest.raises(UserError, match=r"noise=0\.1 0\.2 has 2 deviations"):
         plan(grid(["sac-mlp"], ["pendulum"], {"noise": [[0.1, 0.2]]}))
+
+
+def test_numbers_of_numpy_are_numbers(tmp_path, unchecked):
+    settings = {"deterministic": np.bool_(True), "gamma": np.float64(0.9), "policy_layers": np.array([8, 8])}
+    given = Experiment("vrm", "cartpole", settings, np.arange(2, 4), constants={"max_steps": np.int64(100)})
+    like = {"deterministic": True, "gamma": 0.9, "policy_layers": [8, 8]}
+    same = Experiment("vrm", "cartpole", like, (2, 3), constants={"max_steps": 100})
+    assert given == same
+    assert type(given.seeds[0]) is int
+    for training, other in zip(plan([given]), plan([same]), strict=True):
+        assert training.command(tmp_path) == other.command(tmp_path)
+    (made,) = grid(["vrm"], ["pendulum"], {"gamma": np.array([0.9])}, seeds=np.int64(2))
+    assert (made.seeds, made.settings) == ((0, 1), {"gamma": 0.9})
+
+
+@pytest.mark.parametrize(
+    ("seeds", "phrase"),
+    [
+        (None, "seeds=None is impossible"),
+        (3, "seeds=3 is impossible: give the seed numbers"),
+        ("012", "seeds='012' is impossible"),
+        ((), "seeds has no seed number"),
+        ((0, -1), "seed=-1 is impossible"),
+        ((0, 0.5), r"seed=0\.5 is impossible"),
+        ((True,), "seed=True is impossible"),
+        ((3_000_000_000,), "seed=3000000000 is impossible"),
+    ],
+)
+def test_seeds_are_whole_numbers(seeds, phrase, unchecked):
+    with pytest.raises(UserError, match=phrase):
+        Experiment("vrm", "pendulum", seeds=seeds)
+
+
+@pytest.mark.parametrize("seeds", [0, -1, None, 1.5, True])
+def test_a_grid_has_one_seed_or_more(seeds, unchecked):
+    with pytest.raises(UserError, match=r"seeds=.* is impossible: it must be a whole number of at least 1"):
+        grid(["vrm"], ["pendulum"], seeds=seeds)
 
 
 def test_first_seeds_come_first():
@@ -220,8 +258,21 @@ def test_what_is_written_down_is_read_again(tmp_path):
     assert read(tmp_path) == []
     write(tmp_path, trainings)
     assert read(tmp_path) == trainings
-    (tmp_path / "sweep.json").write_text(json.dumps({"trainings": [{"name": "x"}]}))
-    with pytest.raises(UserError, match=r"sweep.json is damaged"):
+    path = tmp_path / "sweep.json"
+    whole = json.loads(path.read_text())
+    for content, phrase in [
+        ({"format": 1, "trainings": [{"name": "x"}]}, r"sweep\.json is damaged"),
+        ({"trainings": []}, r"sweep\.json is damaged"),
+        ([], r"sweep\.json is damaged"),
+        (whole | {"format": 2}, r"sweep\.json has format 2, which this version cannot read"),
+        ({"format": 2, "runs": []}, r"sweep\.json has format 2, which this version cannot read"),
+    ]:
+        path.write_text(json.dumps(content))
+        with pytest.raises(UserError, match=phrase):
+            read(tmp_path)
+    whole["trainings"][0]["options"]["speed"] = 3
+    path.write_text(json.dumps(whole))
+    with pytest.raises(UserError, match=r"written by another version: this one has no option 'speed'"):
         read(tmp_path)
 
 
@@ -232,6 +283,7 @@ def test_what_is_written_down_is_read_again(tmp_path):
         ("x = 3", "does not define a list `experiments`"),
         ("1 / 0", "ZeroDivisionError"),
         ("def", "SyntaxError"),
+        ("raise SystemExit(3)", "SystemExit: 3"),
     ],
 )
 def test_a_file_without_experiments_is_refused(tmp_path, content, phrase):
@@ -240,6 +292,13 @@ def test_a_file_without_experiments_is_refused(tmp_path, content, phrase):
         load(tmp_path / "mine.py")
     with pytest.raises(UserError, match="no file"):
         load(tmp_path / "yours.py")
+
+
+def test_a_file_may_define_a_dataclass_whose_types_are_text(tmp_path):
+    lines = ("from __future__ import annotations", "import dataclasses", "@dataclasses.dataclass", "class A:")
+    lines += ("    count: int = 3", "experiments = []")
+    (tmp_path / "mine.py").write_text("\n".join(lines))
+    assert load(tmp_path / "mine.py") == []
 
 
 def test_a_file_makes_experiments(tmp_path):

@@ -7,6 +7,7 @@ import signal
 import pytest
 
 from beliefrl import cli, sweep
+from beliefrl.runs.folder import locked
 from beliefrl.sweeps import run as runs
 from beliefrl.sweeps import sources
 from beliefrl.sweeps.experiments import Experiment, grid
@@ -91,6 +92,46 @@ def test_a_sweep_shows_its_trainings_unless_it_is_asked_not_to(tmp_path, capsys)
     assert len(seen[-1].finished) == 4
 
 
+def test_a_finished_sweep_says_so(tmp_path, capsys):
+    sweep(TWO, tmp_path, progress=False)
+    seen = []
+    sweep(TWO, tmp_path, report=seen.append)
+    first, last = capsys.readouterr().out.splitlines()
+    assert first.endswith("4 trainings, 4 of them finished already")
+    assert f"4 of 4 trainings finished in {tmp_path}" in last
+    assert len(seen) == 1
+
+
+def test_nothing_is_started_where_a_cluster_has_shrunk(tmp_path, monkeypatch):
+    shrunk, ended = ["at the first look"], Pretence.ended
+    monkeypatch.setattr(Pretence, "room", property(lambda self: -1 if shrunk else 1 - len(self.running)))
+    monkeypatch.setattr(Pretence, "ended", lambda self: (shrunk.clear(), ended(self))[1])
+    assert len(sweep(TWO, tmp_path).finished) == 4
+
+
+def test_a_training_that_still_ends_is_waited_for_and_the_others_begin(tmp_path, capsys):
+    """After a kill of the sweep its trainings take a while to write their checkpoints."""
+    name = "vrm-pendulum-seed0"
+    (tmp_path / name).mkdir()
+    there = locked(tmp_path / name, "is being trained")
+
+    def end(status):
+        if len(status.finished) == 3:
+            there.close()
+
+    sweep(TWO, tmp_path, report=end)
+    assert Pretence.started[3:] == [name]
+    assert capsys.readouterr().out.count(f"waits: {name}, which another process still trains") == 1
+
+
+def test_an_error_of_a_report_is_not_one_of_the_folder(tmp_path):
+    def report(status):
+        raise FileNotFoundError(2, "No such file", "mine.txt")
+
+    with pytest.raises(FileNotFoundError, match=r"mine\.txt"):
+        sweep(TWO, tmp_path, report=report)
+
+
 def test_a_sweep_can_be_made_longer(tmp_path):
     sweep(TWO, tmp_path)
     Pretence.started.clear()
@@ -120,6 +161,14 @@ def test_a_sweep_that_is_stopped_says_how_to_go_on(tmp_path, capsys):
     assert "trainings finished in" not in capsys.readouterr().out  # the count is only in the message
     assert len(sweep([], tmp_path).finished) == 4
     assert len(Pretence.started) == 4
+
+
+def test_a_folder_with_a_space_is_quoted_in_commands(tmp_path, capsys):
+    folder = tmp_path / "my sweep"
+    with pytest.raises(Stopped, match=r"`beliefrl sweep --out '.*my sweep'` continues"):
+        sweep(TWO, folder, workers=1, report=lambda status: os.kill(os.getpid(), signal.SIGINT))
+    sweep(TWO, folder)
+    assert f"`beliefrl report '{folder}' -o report.html` shows them" in capsys.readouterr().out
 
 
 def test_trainings_that_finish_while_they_are_stopped_count_as_finished(tmp_path, monkeypatch):
@@ -167,16 +216,20 @@ def test_a_folder_that_cannot_be_made_is_an_error(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("log", "why"),
+    ("log", "code", "why"),
     [
-        ("step 1\nbeliefrl: It broke: mend it.\n", "It broke: mend it."),
-        ("Traceback\n  line\nValueError: odd\n", "ValueError: odd"),
-        ("", "it ended with code -9 and printed nothing"),
+        ("step 1\nbeliefrl: It broke: mend it.\n", 2, "It broke: mend it."),
+        ("beliefrl: It broke: mend it.\n", -9, "It broke: mend it."),
+        ("Traceback\n  line\nValueError: odd\n", 1, "ValueError: odd"),
+        ("", 1, "it ended with code 1 and printed nothing"),
+        ("step 1\n", -9, "it was killed by SIGKILL (often too little memory: give fewer --workers)"),
+        ("step 1\n", -11, "it was killed by SIGSEGV"),
+        ("", -99, "it was killed by signal 99"),
     ],
 )
-def test_the_reason_of_a_failure_is_the_last_thing_that_was_said(tmp_path, log, why):
+def test_the_reason_of_a_failure_is_the_last_thing_that_was_said_or_a_signal(tmp_path, log, code, why):
     (tmp_path / "log").write_text(log)
-    assert runs.reason(tmp_path / "log", -9) == why
+    assert runs.reason(tmp_path / "log", code) == why
 
 
 # The command line of `beliefrl sweep`.

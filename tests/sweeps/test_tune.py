@@ -4,12 +4,15 @@ import dataclasses
 import json
 import math
 import os
+import pathlib
 import signal
 import sys
 
 import pytest
 
 from beliefrl import Range, agents, cli, tune
+from beliefrl.runs import records
+from beliefrl.runs.folder import locked
 from beliefrl.sweeps import places, ranges, study
 from beliefrl.sweeps import tune as tuning
 from beliefrl.training.stop import Stopped
@@ -235,9 +238,132 @@ def test_a_trial_that_diverges_is_pruned_and_one_that_fails_is_reported(search, 
 
 def test_a_search_in_which_everything_fails_ends(search, monkeypatch):
     monkeypatch.setattr(Fake, "fails", "trial")
-    with pytest.raises(UserError, match=r"The first 3 trials failed \(it broke\): fix the cause"):
+    with pytest.raises(UserError, match=r"The last 3 trials failed \(it broke\): fix the cause"):
         search(10)
     assert len(Fake.started) == 3
+    monkeypatch.setattr(Fake, "fails", "trial-003")  # failures of earlier sessions do not count
+    assert [trial.state for trial in search(5).trials] == ["complete", *["failed"] * 4]
+
+
+def test_a_search_ends_where_everything_fails_after_a_trial_that_was_complete(search, monkeypatch):
+    search(1)
+    monkeypatch.setattr(Fake, "fails", "trial")
+    with pytest.raises(UserError, match=r"The last 3 trials failed"):
+        search(10)
+    assert len(Fake.started) == 4
+
+
+def test_trials_that_do_not_fail_one_after_the_other_end_no_search(search, monkeypatch):
+    monkeypatch.setattr(Fake, "evaluate", lambda self, training, old=Fake.evaluate: max(old(self, training), 4000))
+    monkeypatch.setattr(Fake, "diverges", "trial-002")
+    ended = Fake.ended
+
+    def some_fail(self):
+        self.fails = "" if "trial-002" in self.running else "trial"
+        return ended(self)
+
+    monkeypatch.setattr(Fake, "ended", some_fail)
+    with pytest.raises(UserError, match=r"No trial in .* is complete \(it broke\): give more trials; .*logs has"):
+        search(5)
+    assert len(Fake.started) == 5
+
+
+def test_settings_that_the_agent_refuses_fail_and_do_not_end_a_search(search, monkeypatch):
+    training = study.Search.training
+
+    def refused(self, name, settings):
+        if name.startswith("trial-") and name != "trial-000":
+            raise UserError("They do not fit.")
+        return training(self, name, settings)
+
+    monkeypatch.setattr(study.Search, "training", refused)
+    assert [trial.state for trial in search(6).trials] == ["complete", *["failed"] * 5]
+
+
+def test_a_finished_search_says_so(search, tmp_path, capsys):
+    search(2, progress=False)
+    assert capsys.readouterr().out == ""
+    search(2)
+    first, last = capsys.readouterr().out.splitlines()
+    assert first.endswith("2 trainings, 2 of them finished already")
+    assert f"2 of 2 trainings finished in {tmp_path / 'search'}" in last
+
+
+def test_a_trial_that_still_ends_is_waited_for(search, tmp_path, monkeypatch):
+    """After a kill of the search its trainings take a while to write their checkpoints."""
+    loop = tuning._Loop.step
+
+    def killed(self):
+        loop(self)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(tuning._Loop, "step", killed)
+        with pytest.raises(KeyboardInterrupt):
+            search(3)
+    assert [training.name for training in Fake.started] == ["trial-000"]
+    there = locked(tmp_path / "search" / "trial-000", "is being trained")
+
+    def step(self):
+        loop(self)
+        if len(self.status.finished) == 2:
+            there.close()
+
+    monkeypatch.setattr(tuning._Loop, "step", step)
+    tuned = search(3)
+    assert [training.name for training in Fake.started[1:]] == ["trial-001", "trial-002", "trial-000"]
+    assert [trial.state for trial in tuned.trials] == ["complete"] * 3
+
+
+def test_a_trial_that_is_stopped_with_the_search_continues_whatever_its_exit_code(search, monkeypatch):
+    loop, ended = tuning._Loop.step, Fake.ended
+
+    def interrupted(self):
+        loop(self)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(tuning._Loop, "step", interrupted)
+        patched.setattr(Fake, "ended", lambda self: {name: code and 1 for name, code in ended(self).items()})
+        with pytest.raises(Stopped):
+            search(1)
+    assert [trial.state for trial in search(1).trials] == ["complete"]
+
+
+def test_each_log_is_read_once_in_a_look(search, monkeypatch):
+    read, lines = [], records.lines
+    monkeypatch.setattr(records, "lines", lambda log: (read.append(log), lines(log))[1])
+    watch = tuning._Loop._watch
+
+    def once(self, name):
+        read.clear()
+        watch(self, name)
+        assert len(read) == len(set(read)) == 2  # two seeds
+
+    monkeypatch.setattr(tuning._Loop, "_watch", once)
+    search(1)
+
+
+def test_a_folder_that_cannot_be_read_is_one_sentence(search, tmp_path, monkeypatch):
+    def refused(folder):
+        raise PermissionError(13, "Permission denied")
+
+    (tmp_path / "search").mkdir()
+    with monkeypatch.context() as patched:
+        patched.setattr(pathlib.Path, "iterdir", refused)
+        with pytest.raises(UserError, match=r"search cannot be written \(Permission denied\)"):
+            search(1)
+
+
+def test_a_journal_is_repaired_in_place(tmp_path, monkeypatch):
+    """If it were written again, a full disk would lose it."""
+    journal = tmp_path / study.JOURNAL
+    monkeypatch.setattr(pathlib.Path, "write_bytes", None)
+    for content, repaired in ((b"{}\n{", b"{}\n"), (b"{", b""), (b"{}\n", b"{}\n")):
+        with journal.open("wb") as file:
+            file.write(content)
+        study._repair(journal)
+        assert journal.read_bytes() == repaired
 
 
 def test_the_objective_is_the_area_under_the_curve_or_the_mode(search, tmp_path):
@@ -315,8 +441,10 @@ def test_the_command_gives_everything_to_the_search(monkeypatch, capsys, tmp_pat
 
     def search(**given):
         asked.update(given)
-        trials = (study.Trial("trial-003", "complete", -1.5, {"tau": 0.1}), study.Trial("trial-000", "failed", 0, {}))
-        return tuning.Tuned({"tau": 0.1}, -1.5, "beliefrl train vrm pendulum-v", tmp_path, tmp_path / "s", trials)
+        failed = study.Trial("trial-000", "failed", 0, {}, "it broke")
+        trials = (study.Trial("trial-003", "complete", -1.5, {"tau": 0.1}), failed)
+        journal = tmp_path / "my search" / study.JOURNAL
+        return tuning.Tuned({"tau": 0.1}, -1.5, "beliefrl train vrm pendulum-v", tmp_path, journal, trials)
 
     monkeypatch.setattr(tuning, "tune", search)
     line = (
@@ -344,5 +472,7 @@ def test_the_command_gives_everything_to_the_search(monkeypatch, capsys, tmp_pat
     }
     out = capsys.readouterr().out
     assert "2 trials, 1 complete, 1 failed" in out
+    assert "1 failed: it broke" in out
+    assert f"`beliefrl report '{tmp_path / 'my search'}' --unfinished`" in out
     assert "tau=0.1" in out
     assert out.endswith("beliefrl train vrm pendulum-v\n")

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 import tomllib
+import types
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from beliefrl.commands.pictures import FilmOptions, PredictOptions, VideoOptions
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.restore import restore_seed
 from beliefrl.types import UserError
-from beliefrl.viewing import demo, films, prediction
+from beliefrl.viewing import demo, encoders, films, prediction
 from inputs import same
 from worlds import Counter, CountingAgent, saved
 
@@ -116,6 +117,23 @@ def test_a_line_below_the_picture_leaves_it_as_it_is_and_its_sides_even():
     np.testing.assert_array_equal(image[:21, :33], pixels)
     assert image.shape[0] % 2 == image.shape[1] % 2 == 0
     assert image[22:].min() < 100 < 200 < image[22:].max()  # ink on paper
+
+
+def test_an_mp4_that_cannot_be_encoded_says_what_ffmpeg_said(tmp_path, monkeypatch):
+    program = tmp_path / "ffmpeg"
+    program.write_text("#!/bin/sh\nexec 0<&-\necho 'Unknown encoder libx264' >&2\nexit 1\n")
+    program.chmod(0o700)
+    package = types.SimpleNamespace(get_ffmpeg_exe=lambda: str(program))
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", package)
+
+    def write():
+        with encoders.encoder(tmp_path / "film.mp4", ".mp4", 10.0) as add:
+            for _ in range(1000):
+                add(np.zeros((100, 100, 3), np.uint8))
+
+    with pytest.raises(UserError, match=r"cannot be written \(Unknown encoder libx264\): choose another file"):
+        write()
+    assert [path.name for path in tmp_path.iterdir()] == ["ffmpeg"]
 
 
 def test_an_mp4_without_its_encoder_is_an_error_in_one_sentence(tmp_path, run, monkeypatch):
@@ -225,7 +243,7 @@ def test_a_gif_of_a_photograph_has_the_colours_of_the_photograph():
     photograph = np.stack([2.6 * x, 4 * y, x + y], -1).astype(np.uint8)
     drawing = np.where((x < 48)[..., None], np.uint8([251, 250, 247]), np.uint8([200, 85, 61]))
     for pixels, most in ((photograph, 4), (drawing, 2)):
-        found = np.array(films._reduced(Image.fromarray(pixels)).convert("RGB"))
+        found = np.array(encoders._reduced(Image.fromarray(pixels)).convert("RGB"))
         assert np.abs(found.astype(int) - pixels).mean() < most
 
 
@@ -291,6 +309,17 @@ def test_a_demo_is_a_run_that_acts_as_well_as_it_says(tmp_path, task, tolerance)
         beliefrl.demo(task, run.folder)
 
 
+def test_a_demo_that_cannot_be_unpacked_leaves_no_folder(tmp_path, monkeypatch):
+    def full(self, folder):
+        (folder / "config.json").write_text("{}")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(demo.zipfile.ZipFile, "extractall", full)
+    with pytest.raises(UserError, match=r"run cannot be made \(No space left on device\): choose another folder"):
+        beliefrl.demo("pendulum-v", tmp_path / "run")
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.fixture
 def no_display(tmp_path, monkeypatch):
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
@@ -343,4 +372,10 @@ def test_an_environment_that_changes_the_working_directory_does_not_move_the_fil
     os.chdir(tmp_path / "here")
     films.video(run, "film.gif", fps=20.0, steps=2, task=task)
     assert (tmp_path / "here" / "film.gif").exists()
+    os.chdir(tmp_path / "here")
+    assert films.film(run, "film.png", frames=2, steps=2, task=task) == pathlib.Path("film.png")
+    assert (tmp_path / "here" / "film.png").exists()
+    os.chdir(tmp_path)
+    run = beliefrl.Run("run")
+    assert films.film(run, frames=2, steps=2, task=task) == tmp_path / "run" / "film.png"
     assert not any((tmp_path / "elsewhere").iterdir())

@@ -104,7 +104,7 @@ def curve_figure(run: Run) -> Any:
     """
     group = Group(task_label(run), run.config["agent"], [(run, seed) for seed in run.seeds])
     if not group.curve("sampled").steps.size:
-        raise UserError(f"{run.folder} has no evaluation of every seed yet, so there is no curve to draw.")
+        raise UserError(f"{run.shown} has no evaluation of every seed yet, so there is no curve to draw.")
     panels = ["", *group.measures]
     made = figure(5.6 * len(panels), 3.6)
     axes = made.subplots(1, len(panels), squeeze=False)[0]

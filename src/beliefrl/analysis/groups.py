@@ -252,7 +252,7 @@ def shortened_by(group: Group) -> str | None:
     if steps[-1] >= longest:
         return None
     return (
-        f"{group.label} on {group.task} ends at step {steps[-1]:,}, the last that all of its seeds have: {run.folder}, "
+        f"{group.label} on {group.task} ends at step {steps[-1]:,}, the last that all of its seeds have: {run.shown}, "
         f"seed {seed}, ends at {last_step(run, seed):,}, and another seed at {longest:,}"
     )
 

@@ -65,7 +65,7 @@ def figure(argv: Sequence[str]) -> None:
     out = options.out or pathlib.Path(kind)
     path, more = _draw(kind, runs, out, options.actions)
     if kind in TABLES:
-        print(path.read_text(), end="")
+        print(path.read_text(encoding="utf-8"), end="")
     for note in notes + more:
         print(note)
     print(f"written to {path} and {path.with_suffix('.tex' if kind in TABLES else '.pdf').name}")
@@ -112,9 +112,7 @@ def _runs(options: FigureOptions, kind: str) -> tuple[list[Any], list[str]]:
             f"None of the {len(found.runs)} runs is both selected and finished: select others, or add --unfinished."
         )
     notes = [f"damaged: {why}" for why in found.damage]
-    notes += [
-        f"left out: {run.folder} is not finished (--unfinished includes it)" for run in chosen if run not in drawn
-    ]
+    notes += [f"left out: {run.shown} is not finished (--unfinished includes it)" for run in chosen if run not in drawn]
     return drawn if options.until is None else [results.cut(run, options.until) for run in drawn], notes
 
 

@@ -112,10 +112,12 @@ def predict(argv: Sequence[str]) -> None:
 
     run = Run(options.run)
     path = options.out or run.folder / "predictions.png"
-    figures.paths(path)  # raises an error before the episode is played
+    png, _ = figures.paths(path)  # raises an error before the episode is played
+    place = path.absolute()  # an environment may change the working directory
     names = ("seed", "model", "start", "horizon", "samples", "episode_seed", "sampled", "best")
     predicted = predictions(run, agent=own_agent(options.agent), **{name: getattr(options, name) for name in names})
-    _written(draw_predictions(predicted, path, options.entries or None))
+    draw_predictions(predicted, place, options.entries or None)
+    _written(png)
 
 
 def video(argv: Sequence[str]) -> None:

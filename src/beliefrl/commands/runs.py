@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from beliefrl.commands.arguments import Best, OwnAgent, RunFolder, Seed, named_values, own_agent, parse
+from beliefrl.errors import UserError, one_line
 
 if TYPE_CHECKING:
     from beliefrl.runs.run import Run
@@ -68,13 +69,18 @@ def show(argv: Sequence[str]) -> None:
     from beliefrl.training.restore import agent_of
 
     run, console = Run(options.run), Console()
-    agent = None if is_own(run.config["agent"]) else agent_of(run)  # a user's own class is not needed
+    agent, notes = None, [f"damaged: {sentence}" for sentence in run.damage()]
+    if not is_own(run.config["agent"]):  # a user's own class is not needed
+        try:
+            agent = agent_of(run)
+        except UserError as error:  # of another version, or of a package that is not installed
+            notes.append(str(error))
     table, results = run_table(run, agent), run.results()
     console.print(table)
     if results:
         console.print(results_table(results, run.seeds, f"after {results['step']:,} steps"))
-    for sentence in run.damage():
-        console.print(f"damaged: {sentence}", markup=False, highlight=False, soft_wrap=True)
+    for note in notes:
+        console.print(one_line(note), markup=False, highlight=False, soft_wrap=True)
 
 
 def evaluate(argv: Sequence[str]) -> None:

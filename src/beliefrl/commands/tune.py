@@ -2,6 +2,8 @@
 
 import dataclasses
 import pathlib
+import shlex
+from collections import Counter
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
@@ -77,8 +79,11 @@ def tune(argv: Sequence[str]) -> None:
     )
     console = Console()
     console.print(_table(tuned))
+    for why, count in Counter(trial.why for trial in tuned.trials if trial.state == "failed").items():
+        print(f"{count} failed: {why or 'stopped before the training began'}")
     folder = tuned.study.parent
-    print(f"{folder} has history.png and importance.png; `beliefrl report {folder} --unfinished` shows the trials")
+    shows = f"`beliefrl report {shlex.quote(str(folder))} --unfinished` shows the trials"
+    print(f"{folder} has history.png and importance.png; {shows}")
     print("this trains the best settings with new seeds:\n")
     print(tuned.command)  # one line, to be copied
 
@@ -87,13 +92,11 @@ def _ranges(given: Sequence[str]) -> dict[str, Any]:
     """The ranges that --range gives."""
     from beliefrl.sweeps.ranges import from_text
 
-    found = {}
-    for each in given:
-        ((name, values),) = value_lists([each], "--range").items()
-        if name in found:
-            raise UserError(f"--range has {name} twice: give it once.")
-        found[name] = from_text(name, each.partition("=")[2]) or values
-    return found
+    lists = value_lists(given, "--range").items()
+    return {
+        name: from_text(name, each.partition("=")[2]) or values
+        for each, (name, values) in zip(given, lists, strict=True)
+    }
 
 
 def _settings(options: TuneOptions) -> dict[str, Any]:

@@ -19,7 +19,7 @@ import gymnasium
 import numpy as np
 
 from beliefrl.onnx.graph import model
-from beliefrl.types import UserError
+from beliefrl.types import UserError, said
 
 LARGEST_DIFFERENCE = 1e-5  # between a policy and its model
 CHECKED_STEPS = 200
@@ -36,8 +36,8 @@ def export(policy: Any, environment: Callable[[], Any] | None = None) -> tuple[b
     entries and the bounds of the actions, as lists in JSON.
 
     Raises:
-        UserError: a package is missing, the agent uses a primitive that is not supported, or the difference is more
-            than 1e-5.
+        UserError: a package is missing, the agent uses a primitive that is not supported, onnxruntime cannot run the
+            model, or the difference is more than 1e-5.
     """
     try:
         onnx, runtime = (importlib.import_module(name) for name in ("onnx", "onnxruntime"))
@@ -54,7 +54,9 @@ def export(policy: Any, environment: Callable[[], Any] | None = None) -> tuple[b
     interface = {} if policy.interface is None else policy.interface._asdict()
     about = {"policy": repr(policy), **{name: json.dumps(value) for name, value in interface.items()}}
     content = model(onnx, policy.mode, inputs, outputs, about)
-    difference = _difference(policy, runtime, content, _made(environment) or _MadeUp(policy.spec.obs_dim))
+    session = _session(runtime, content)  # before a robot is started
+    with contextlib.closing(_made(environment) or _MadeUp(policy.spec.obs_dim)) as made:
+        difference = _largest(policy, session, made)
     if not difference <= LARGEST_DIFFERENCE:
         raise UserError(
             f"The ONNX model differs from the policy by {difference:.1g}, more than {LARGEST_DIFFERENCE:.0e}: export "
@@ -69,17 +71,23 @@ def _made(environment: Callable[[], Any] | None) -> Any:
         return environment and environment()
 
 
-def _difference(policy: Any, runtime: Any, content: bytes, environment: Any) -> float:
-    """The largest difference between a policy and its model along an episode."""
+def _session(runtime: Any, content: bytes) -> Any:
+    """The model in onnxruntime, on one thread.
+
+    Raises:
+        UserError: onnxruntime cannot run it.
+    """
     options = runtime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
-    session = runtime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-    with contextlib.closing(environment):
-        return _largest(policy, session, environment)
+    try:
+        return runtime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # its errors have no common class
+        why = said(error)
+        raise UserError(f"onnxruntime cannot run the model ({why}): export the policy as a .jax file.") from None
 
 
 def _largest(policy: Any, session: Any, environment: Any) -> float:
-    """The same, with the session of the model."""
+    """The largest difference between a policy and its model along an episode; NaN if the model has one."""
     names = [each.name for each in session.get_inputs()]
     obs, _ = environment.reset(seed=0)
     reward, state, largest = 0.0, policy.initial_state(1), 0.0
@@ -91,7 +99,7 @@ def _largest(policy: Any, session: Any, environment: Any) -> float:
         action, state = policy.predict(obs, reward, state, start[0])
         for ours, theirs in zip((action[None], *state), outputs, strict=True):
             error = np.abs(theirs.astype(np.float64) - ours) / np.maximum(1.0, np.abs(ours))
-            largest = max(largest, float(np.max(error, initial=0.0)))
+            largest = float(np.maximum(largest, np.max(error, initial=0.0)))  # NaN stays, unlike with `max`
         obs, reward, terminated, truncated, _ = environment.step(action)
         if terminated or truncated:
             break

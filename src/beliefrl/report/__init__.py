@@ -19,7 +19,8 @@ from string import Template
 from typing import Any
 
 from beliefrl.analysis.groups import find
-from beliefrl.report.data import CachedRun, page_data
+from beliefrl.report.data import page_data
+from beliefrl.runs.cached import CachedRun
 from beliefrl.runs.given_files import as_path, check_folder, write_given
 from beliefrl.types import UserError
 
@@ -51,7 +52,8 @@ def write_report(
     check_folder(out)
     found = find(paths, CachedRun)
     data = page_data(found.runs, out.parent, unfinished)
-    content = page(data | {"damage": [*data.pop("without_curve"), *found.damage]})
+    left_out = data.pop("without_curve")
+    content = page(data | {"damage": [*left_out, *found.damage]})
     write_given(out, content.encode())
     if note is not None:
         for sentence in found.damage:

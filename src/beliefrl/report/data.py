@@ -4,7 +4,7 @@ import json
 import os
 import pathlib
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 from urllib.parse import quote
 
@@ -17,29 +17,12 @@ from beliefrl.analysis.panels import colours, dashes
 from beliefrl.analysis.results import changed
 from beliefrl.analysis.tables import wall_clock
 from beliefrl.runs.records import sessions
-from beliefrl.runs.run import Row, Run
+from beliefrl.runs.run import Run
 from beliefrl.training.summary import MODES
 
 MEDIA = (".mp4", ".webm", ".gif")
 PICTURE = "curve.png"
 INTERVAL = 0.95
-
-
-class CachedRun(Run):
-    """A run that reads its logs once and caches the kinds of rows that a report needs."""
-
-    KINDS = ("evaluation", "diverged")
-
-    def __init__(self, folder: str | os.PathLike[str]):
-        super().__init__(folder)
-        self._rows: dict[int, list[Row]] = {}
-
-    def rows(self, seed: int, kind: str | None = None) -> Iterator[Row]:
-        if kind not in self.KINDS:
-            return super().rows(seed, kind)
-        if seed not in self._rows:
-            self._rows[seed] = [row for row in super().rows(seed) if row["kind"] in self.KINDS]
-        return (row for row in self._rows[seed] if row["kind"] == kind)
 
 
 def page_data(runs: Sequence[Run], page_folder: pathlib.Path, unfinished: bool = False) -> dict[str, Any]:
@@ -133,7 +116,7 @@ def _run(run: Run, page_folder: pathlib.Path, groups_of: Sequence[int | None]) -
     config = run.config
     steps = {seed: last_step(run, seed) for seed in run.seeds}
     return {
-        "folder": str(run.folder),
+        "folder": run.shown,
         "agent": config["agent"],
         "task": task_label(run),
         "group": next((index for index in groups_of if index is not None), None),
@@ -177,4 +160,8 @@ def _media(folder: pathlib.Path) -> list[pathlib.Path]:
 
 def _link(folder: pathlib.Path, path: pathlib.Path) -> dict[str, str]:
     """A file's name, and its address relative to a page in `folder`."""
-    return {"name": path.name, "address": quote(os.path.relpath(path, folder).replace(os.sep, "/"))}
+    try:
+        address = quote(os.path.relpath(path, folder).replace(os.sep, "/"))
+    except ValueError:  # on Windows: another drive
+        address = path.absolute().as_uri()
+    return {"name": path.name, "address": address}

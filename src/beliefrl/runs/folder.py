@@ -7,6 +7,7 @@ import os
 import pathlib
 import platform
 import re
+import shlex
 import shutil
 from typing import Any
 
@@ -19,6 +20,7 @@ UNSAVED = (  # files of a training that has saved no agent and no checkpoint
     rf"{MAKING}|config\.json|metrics/seed-\d+\.jsonl|\.[\w.-]+\.tmp|(tensorboard|wandb)(/.*)?"
     r"|initial(-replay)?\.safetensors|checkpoints(/replay(/.*)?|/\.[^/]*\.tmp(/.*)?)?"
 )
+HELD = (errno.EAGAIN, errno.EWOULDBLOCK, errno.EACCES)  # of a lock that another process has
 
 
 def make(folder: pathlib.Path, config: dict[str, Any]) -> None:
@@ -47,7 +49,8 @@ def clear(folder: pathlib.Path) -> None:
     inside = [path.relative_to(folder).as_posix() for path in folder.rglob("*")]
     is_run = _is_of_training(folder)
     if not all(re.fullmatch(UNSAVED if is_run else MAKING, name) for name in inside):
-        go_on, in_python = (f", or `beliefrl resume {folder}`", " or resume=True") if is_run else ("", "")
+        command = f"beliefrl resume {shlex.quote(str(folder))}"
+        go_on, in_python = (f", or `{command}`", " or resume=True") if is_run else ("", "")
         raise UserError(f"{folder} exists already: choose another --out{go_on}; in Python out={in_python}.")
     if not inside:
         return
@@ -103,7 +106,7 @@ def locked(folder: pathlib.Path, doing: str) -> Any:
     except ImportError:  # this system has no fcntl
         return file
     except OSError as error:
-        if error.errno not in (errno.EAGAIN, errno.EWOULDBLOCK, errno.EACCES):  # a file system without locks
+        if error.errno not in HELD:  # a file system without locks
             return file
         file.seek(0)
         who = file.read().strip() or "another"
@@ -120,14 +123,35 @@ def locked(folder: pathlib.Path, doing: str) -> Any:
     return file
 
 
+def is_locked(folder: pathlib.Path) -> bool:
+    """Whether another process has locked the folder. False if it does not exist, or if nothing can be locked."""
+    try:
+        import fcntl
+
+        file = (folder / "lock").open("r+")
+    except (ImportError, OSError):
+        return False
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except OSError as error:
+            return error.errno in HELD
+    return False
+
+
 def _is_of_training(folder: pathlib.Path) -> bool:
     """Whether a training wrote the config.json in the folder."""
     return records.is_complete(records.parsed(folder / "config.json"))
 
 
+def folder_name(text: str) -> str:
+    """The text as the name of a folder: special characters become dashes."""
+    return re.sub(r"[^\w.=,-]+", "-", text)
+
+
 def free_folder(name: str, parent: str = "runs") -> pathlib.Path:
-    """The first of runs/NAME-1, runs/NAME-2, ... that does not exist; special characters become dashes."""
-    number, name = 1, re.sub(r"[^\w.-]+", "-", name)
+    """The first of runs/NAME-1, runs/NAME-2, ... that does not exist; NAME is a `folder_name`."""
+    number, name = 1, folder_name(name)
     while os.path.exists(folder := pathlib.Path(parent) / f"{name}-{number}"):  # noqa: PTH110 - as in `train`
         number += 1
     return folder

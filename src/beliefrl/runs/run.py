@@ -1,8 +1,11 @@
 """A run's folder, which a training writes.
 
     config.json           agent, task, options, versions, git commit, command line
-    metrics/seed-0.jsonl  one line for each entry: {"step", "kind": "update" | "episode" | "evaluation", ...}
-    tensorboard/seed-0/   the same entries as TensorBoard events
+    lock                  the process that trains; it has locked this file (`folder`)
+    metrics/seed-0.jsonl  one line for each entry: {"step", "kind", ...}; kinds: pretrain, update, episode, evaluation,
+                          diverged
+    tensorboard/seed-0/, wandb/   the same entries for trackers (`trackers`)
+    checkpoints/          everything that a training needs to continue (`checkpoint`)
     agent.safetensors     the agents of all seeds (leading axis) at the last evaluation, or at the step at which an
                           environment failed; plain arrays, no code
     best.safetensors      the same at the evaluation with the highest return of each seed
@@ -10,6 +13,8 @@
     initial-replay.safetensors   the replays before the first step, if they come from another run
     results.json          the returns of the last evaluation
     curve.png             the learning curve
+    before-1/, ...        logs, agents and results of a training that began again (`folder.set_aside`)
+    damaged-NAME          a damaged file that was moved aside
 
 Lines are flushed one by one, so a killed training loses at most the line that it was writing, and `rows` skips it. The
 content of files is checked when it is read (`records`), so callers need not check it again.
@@ -48,12 +53,13 @@ class Run:
         """
         if not isinstance(folder, str | os.PathLike):
             raise UserError(f"{folder!r} is not a run: give a run, or the path of its folder.")
-        self.folder = pathlib.Path(folder)
+        self.shown = str(pathlib.Path(folder))  # as it was given, for messages
+        self.folder = pathlib.Path(folder).absolute()  # an environment may change the working directory
         if not os.path.isdir(self.folder):  # noqa: PTH112 - pathlib's version raises if a name is too long
-            raise UserError(f"There is no run folder {self.folder}: give the --out of a training.")
+            raise UserError(f"There is no run folder {self.shown}: give the --out of a training.")
         path = self.folder / "config.json"
         if not os.path.exists(path):  # noqa: PTH110
-            raise UserError(f"{self.folder} is not a run: it has no config.json; give the --out of a training.")
+            raise UserError(f"{self.shown} is not a run: it has no config.json; give the --out of a training.")
         self.config: dict[str, Any] = records.parsed(path)
         if self.config is None:
             raise UserError(f"{path} cannot be read as JSON: restore it, or train again.")
@@ -70,11 +76,6 @@ class Run:
         known = {field.name for field in dataclasses.fields(Options)}
         given = tuples(self.config["options"])
         return Options(**{name: value for name, value in given.items() if name in known})
-
-    @property
-    def shown(self) -> str:
-        """The folder as it was given, for messages."""
-        return str(self.folder)
 
     def __repr__(self) -> str:
         """The folder, the agent and the task: `<Run runs/first: vrm on pendulum-v>`."""
@@ -166,9 +167,9 @@ class Run:
         if path.exists():
             return path
         if best and any(row for seed in self.seeds for row in self.rows(seed, "evaluation")):
-            raise UserError(f"{self.folder} has only its last agent: leave out --best, in Python best=.")
+            raise UserError(f"{self.shown} has only its last agent: leave out --best, in Python best=.")
         which = "best" if best else "trained"
-        raise UserError(f"{self.folder} has no {which} agent yet: it is saved at the first evaluation.")
+        raise UserError(f"{self.shown} has no {which} agent yet: it is saved at the first evaluation.")
 
 
 class Recorder(Run):
@@ -181,12 +182,10 @@ class Recorder(Run):
             UserError: the folder exists already or cannot be made (with a config), does not exist (without), or is
                 written by another process; or a tracker cannot be opened.
         """
-        self._given = str(folder)
-        folder = pathlib.Path.cwd() / as_path(folder)  # an environment may change the working directory
         if config is not None:
-            make(folder, config)
+            make(as_path(folder), config)
         super().__init__(folder)
-        self._lock = locked(folder, "is being trained")
+        self._lock = locked(self.folder, "is being trained")
         self._lines: dict[int, Any] = {}
         self._trackers: dict[int, list[Tracker]] = {}
         if config is not None:
@@ -194,10 +193,6 @@ class Recorder(Run):
                 stack.push(self)
                 self._open()
                 stack.pop_all()
-
-    @property
-    def shown(self) -> str:
-        return self._given
 
     def __enter__(self) -> "Recorder":
         return self
@@ -269,9 +264,16 @@ class Recorder(Run):
                 tracker.flush()
 
     def save(self, agents: Any, but: Collection[int] = (), step: int | None = None) -> None:
-        """Save the agents of all seeds at a step atomically; those of the seeds `but` (indices) are not changed."""
+        """Save the agents of all seeds at a step atomically; those of the seeds `but` (indices) are not changed.
+
+        A damaged file is moved to damaged-agent.safetensors.
+        """
         path, saved = self.folder / "agent.safetensors", arrays.copied(agents)
-        before = arrays.load(path) if but and path.exists() else {}
+        try:
+            before = arrays.load(path) if but and path.exists() else {}
+        except arrays.Damaged:
+            path.replace(self.folder / f"damaged-{path.name}")
+            before = {}
         for name, kept in before.items():
             saved[name][sorted(but)] = kept[sorted(but)]
         write_whole(path, arrays.packed(saved, None if step is None else {"step": str(step)}))

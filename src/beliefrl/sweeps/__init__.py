@@ -1,1 +1,3 @@
-"""Sweeps of many trainings: the list (`plan`, `sources`), where they run (`places`), the loop (`run`)."""
+"""Sweeps of many trainings: what to train (`experiments`, `sources`), the list (`plan`), where they run (`places`), the
+loop (`run`) and its display (`progress`); and searches for hyperparameters (`tune`, `study`, `ranges`).
+"""

@@ -5,8 +5,9 @@ import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from beliefrl.types import UserError, short
+from beliefrl.types import UserError, check_whole, plain, short
 
+MOST = 2_000_000_000  # the highest seed number, as in `Options`
 NAMED = Mapping, "a dictionary from names to values"
 KINDS = (
     ("agent", str, "its name"),
@@ -19,7 +20,10 @@ KINDS = (
 
 @dataclasses.dataclass(frozen=True)
 class Experiment:
-    """An agent with its settings on a task, and the seeds to train: one line of a figure."""
+    """An agent with its settings on a task, and the seeds to train: one line of a figure.
+
+    Values are kept as JSON has them, so NumPy's numbers may be given.
+    """
 
     agent: str
     """The agent's name."""
@@ -36,13 +40,27 @@ class Experiment:
     """The task's constants, as in `make_task`."""
 
     def __post_init__(self) -> None:
-        """Refuse impossible types, and a number of seeds, with a UserError."""
+        """Raise a UserError if a type is impossible, or a seed. Make the values plain."""
         for name, kinds, what in KINDS:
             value = getattr(self, name)
             if not isinstance(value, kinds):
                 raise UserError(f"{name}={short(value)} is impossible: give {what}.")
-        if isinstance(self.seeds, int | str):
-            raise UserError(f"seeds={self.seeds} is impossible: give the seed numbers, such as (0, 1, 2), or use grid.")
+        object.__setattr__(self, "seeds", _numbers(self.seeds))
+        for name in ("settings", "constants"):
+            object.__setattr__(self, name, plain(dict(getattr(self, name))))
+
+
+def _numbers(seeds: Any) -> tuple[int, ...]:
+    """The numbers of seeds as a tuple. Raise a UserError if they are none."""
+    if isinstance(seeds, str) or not isinstance(seeds, Iterable):
+        given = short(seeds)
+        raise UserError(f"seeds={given} is impossible: give the seed numbers, such as (0, 1, 2), or use grid.")
+    numbers = tuple(seeds)
+    if not numbers:
+        raise UserError("seeds has no seed number: give one or more, such as (0, 1, 2).")
+    for number in numbers:
+        check_whole("seed", number, 0, MOST)
+    return tuple(map(int, numbers))
 
 
 def grid(
@@ -72,9 +90,11 @@ def grid(
         if isinstance(value, str) or not isinstance(value, Iterable):
             raise UserError(f"{name}={value} is not a list of values: give [{value!r}], or {name}= as an argument.")
     names, values = list(settings or {}), list((settings or {}).values())
-    numbers = range(seeds) if isinstance(seeds, int) else seeds
+    if not isinstance(seeds, Iterable):
+        check_whole("seeds", seeds, 1)
+    numbers = seeds if isinstance(seeds, Iterable) else range(seeds)
     return [
-        Experiment(agent, task, {**fixed, **dict(zip(names, combination, strict=True))}, tuple(numbers))
+        Experiment(agent, task, {**fixed, **dict(zip(names, combination, strict=True))}, numbers)
         for task in tasks
         for agent in agents
         for combination in itertools.product(*values)

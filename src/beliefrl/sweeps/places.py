@@ -42,7 +42,7 @@ class Local:
         """Start a training in a free slot."""
         slot = self.free.pop(0)
         core = slot if slot.isdigit() else "-"
-        command = [sys.executable, "-m", "beliefrl.worker", core, *training.command(self.sweep)]
+        command = worker(core, training.command(self.sweep))
         with open_log(self.sweep / "logs" / f"{training.name}.log") as log:
             process = subprocess.Popen(
                 command,
@@ -70,6 +70,11 @@ class Local:
             process.send_signal(signal.SIGTERM)
         for process, _ in self._running.values():
             process.wait()
+
+
+def worker(core: str, command: list[str]) -> list[str]:
+    """The command of a process that runs a training for this process."""
+    return [sys.executable, "-m", "beliefrl.worker", str(os.getpid()), core, *command]
 
 
 def open_log(path: pathlib.Path) -> IO[bytes]:
@@ -148,10 +153,10 @@ class Cluster:
 
     @property
     def room(self) -> int:
-        """How many trainings can be started now. It may grow with the cluster."""
+        """How many trainings can be started now. It grows and shrinks with the cluster."""
         total = self._ray.cluster_resources().get("GPU" if self.has_gpus else "CPU", 0)
         most = 1 if self._workers == 0 else self._workers or total
-        return int(min(total, most)) - len(self._running)
+        return max(0, int(min(total, most)) - len(self._running))
 
     def start(self, training: Training) -> None:
         log = self.sweep / "logs" / f"{training.name}.log"
@@ -199,7 +204,7 @@ def train_on_node(sweep: str, log: str, command: list[str], on_gpu: bool) -> int
     slot = f"gpu{os.environ.get('CUDA_VISIBLE_DEVICES', '0')}" if on_gpu else "any"
     with open_log(pathlib.Path(log)) as out:
         process = subprocess.Popen(
-            [sys.executable, "-m", "beliefrl.worker", "-", *command],
+            worker("-", command),
             env=environment(pathlib.Path(sweep), slot),
             stdin=subprocess.DEVNULL,
             stdout=out,

@@ -12,12 +12,12 @@ import dataclasses
 import hashlib
 import json
 import pathlib
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from beliefrl import agents, tasks
 from beliefrl.catalogue import unmasked
+from beliefrl.runs.folder import folder_name
 from beliefrl.runs.options import Options
 from beliefrl.runs.run import Run
 from beliefrl.sweeps.experiments import Experiment
@@ -52,16 +52,17 @@ class Training:
     def seeds(self) -> list[int]:
         return list(range(self.options["seed"], self.options["seed"] + self.options["seeds"]))
 
-    def command(self, sweep: pathlib.Path) -> list[str]:
-        """The arguments of `beliefrl` that start this training, or continue it."""
+    def arguments(self) -> list[str]:
+        """The arguments of `beliefrl` that train this, without a folder."""
         given = [*self.settings.items(), *self.options.items(), *self.faults.items()]
         flags = [part for name, value in given for part in _flag(name, value)]
         seen = ["--observe", *self.observe] if self.observe else []
         made = ["--constants", *(f"{name}={json.dumps(value)}" for name, value in self.constants.items())]
-        return [
-            *("train", self.agent, self.task, *flags, *seen, *(made if self.constants else [])),
-            *("--out", str(sweep / self.name), "--resume"),
-        ]
+        return ["train", self.agent, self.task, *flags, *seen, *(made if self.constants else [])]
+
+    def command(self, sweep: pathlib.Path) -> list[str]:
+        """The arguments of `beliefrl` that start this training in the sweep's folder, or continue it."""
+        return [*self.arguments(), "--out", str(sweep / self.name), "--resume"]
 
     def is_finished(self, sweep: pathlib.Path) -> bool:
         """Whether the run was evaluated at its last step, has reached `stop_at`, or all its seeds have diverged."""
@@ -131,7 +132,8 @@ def extended(
                 own = {name: training.options[name] for name in ("seed", "seeds")}
                 trainings[training.name] = dataclasses.replace(training, options=like.options | own)
                 present |= set(training.seeds)
-        added.append(dataclasses.replace(experiment, seeds=tuple(set(experiment.seeds) - present)))
+        if left := set(experiment.seeds) - present:
+            added.append(dataclasses.replace(experiment, seeds=tuple(left)))
     _check(trainings.values())
     new = plan(added, seeds_per_run)
     for name in (each.name for each in new if each.name in trainings):
@@ -172,7 +174,7 @@ def _training(experiment: Experiment, first: int, count: int) -> Training:
     observe = (given,) if isinstance(given, int | str) else tuple(given)
     seen = [f"observe={_as_text(observe)}"] if observe else []
     seeds = f"seed{first}" + (f"to{first + count - 1}" if count > 1 else "")
-    name = re.sub(r"[^\w.=,-]+", "-", "-".join([experiment.agent, experiment.task, *changed, *seen]))
+    name = folder_name("-".join([experiment.agent, experiment.task, *changed, *seen]))
     if len(name) > LONGEST_NAME:
         name = f"{name[: LONGEST_NAME - 9]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
     options = {"steps": Options.steps} | options | {"seed": first, "seeds": count}

@@ -4,12 +4,14 @@ import dataclasses
 import pathlib
 import statistics
 import time
+from shlex import quote
 from typing import NamedTuple
 
 from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from beliefrl.runs.folder import is_locked
 from beliefrl.runs.run import Run
 from beliefrl.sweeps.plan import Training
 from beliefrl.training.screen import Screen, duration
@@ -33,10 +35,22 @@ class SweepStatus:
     failed: dict[str, str] = dataclasses.field(default_factory=dict)  # name: the last error message of the training
     pruned: list[Training] = dataclasses.field(default_factory=list)
     notes: dict[str, str] = dataclasses.field(default_factory=dict)  # name: what the display adds to its lines
+    held: set[str] = dataclasses.field(default_factory=set)  # names of those that waited for another process
 
     @property
     def count(self) -> int:
         return len(self.finished) + len(self.waiting) + len(self.running) + len(self.failed) + len(self.pruned)
+
+    def take(self, folder: pathlib.Path) -> Training | None:
+        """Take the first waiting training whose run in `folder` no other process trains; None if there is none.
+
+        Trainings of a sweep that was killed take a while to end, after the sweep has been started again.
+        """
+        for index, training in enumerate(self.waiting):
+            if not is_locked(folder / training.name):
+                return self.waiting.pop(index)
+            self.held.add(training.name)
+        return None
 
 
 class SweepProgress:
@@ -133,7 +147,7 @@ class SweepDisplay:
         if kind is None and self.before is not None:
             pruned = f" ({len(self.before.pruned)} pruned)" if self.before.pruned else ""
             done = f"{len(self.before.finished)} of {self.before.count} trainings finished{pruned} in {self.folder}"
-            self.screen.line(f"{done}; `beliefrl report {self.folder} -o report.html` shows them")
+            self.screen.line(f"{done}; `beliefrl report {quote(str(self.folder))} -o report.html` shows them")
 
     def __call__(self, status: SweepStatus) -> None:
         """Show the state of a sweep."""
@@ -144,8 +158,11 @@ class SweepDisplay:
     def _say_changes(self, status: SweepStatus) -> None:
         if self.before is None:
             already = f", {len(status.finished)} of them finished already" if status.finished else ""
-            self.screen.line(f"{status.count} trainings{already}, {len(status.running)} at a time")
+            together = f", {len(status.running)} at a time" if status.running else ""
+            self.screen.line(f"{status.count} trainings{already}{together}")
             self.before = SweepStatus([*status.finished], [], pruned=[*status.pruned])
+        for name in status.held - self.before.held:
+            self.screen.line(f"waits: {name}, which another process still trains")
         for name in status.running:
             if name not in self.before.running:
                 self.screen.line(f"begins: {name}{_note(status, name)}")
@@ -157,7 +174,12 @@ class SweepDisplay:
             if name not in self.before.failed:
                 self.screen.line(f"failed: {name}: {why}")
         self.before = SweepStatus(
-            [*status.finished], [*status.waiting], dict(status.running), dict(status.failed), [*status.pruned]
+            [*status.finished],
+            [*status.waiting],
+            dict(status.running),
+            dict(status.failed),
+            [*status.pruned],
+            held=set(status.held),
         )
 
     def _summary(self, status: SweepStatus) -> str:

@@ -2,8 +2,11 @@
 
 import contextlib
 import dataclasses
+import functools
 import os
 import pathlib
+import shlex
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -86,6 +89,7 @@ def sweep(
             together = seeds_per_run or (ALL if on_gpu else None)
             trainings = plans.extended(before, experiments, together)
             _check_options(folder, trainings)
+            sources.write(folder, trainings)
             status = _status(folder, trainings)
             with reporting(folder, report, progress) as listen, Requests(confirm) as requests:
                 _loop(folder, status, launcher, listen, requests)
@@ -100,11 +104,17 @@ def sweep(
     return status
 
 
+class _OfReport(Exception):
+    """An OSError that `report` has raised. `writing` takes an OSError for one of the folder."""
+
+
 @contextlib.contextmanager
 def writing(folder: pathlib.Path) -> Iterator[None]:
-    """Raise a UserError in place of an OSError, such as that of a full disk."""
+    """Raise a UserError in place of an OSError, such as that of a full disk; not in place of one of `report`."""
     try:
         yield
+    except _OfReport as error:
+        raise error.__cause__ or error from None
     except ConnectionError:  # also BrokenPipeError: the reader of the output has closed it
         raise
     except OSError as error:
@@ -123,12 +133,19 @@ def confirm() -> None:
 def reporting(folder: pathlib.Path, report: Report | None, progress: bool) -> Iterator[Report]:
     """Yields a function to call with every state of the sweep. It calls `report`, and the display if `progress`."""
     with contextlib.ExitStack() as stack:
-        listeners = [] if report is None else [report]
+        listeners: list[Report] = [] if report is None else [functools.partial(_call, report)]
         if progress:
             from beliefrl.training.screen import screen
 
             listeners.insert(0, stack.enter_context(SweepDisplay(screen(), folder)))
         yield lambda status: [listen(status) for listen in listeners]
+
+
+def _call(report: Report, status: SweepStatus) -> None:
+    try:
+        report(status)
+    except OSError as error:
+        raise _OfReport from error
 
 
 def _check_named(folder: pathlib.Path, before: Sequence[Training], experiments: Sequence[Experiment]) -> None:
@@ -151,22 +168,20 @@ def _check_options(folder: pathlib.Path, trainings: Sequence[Training]) -> None:
         for name, value in dataclasses.asdict(plans.options_of(training)).items():
             if name not in (*CHANGEABLE, *OF_A_RUN) and plain(there[name]) != plain(value):
                 raise UserError(
-                    f"{run.folder} was trained with {name}={there[name]}, not {value}: give that value, or choose "
+                    f"{run.shown} was trained with {name}={there[name]}, not {value}: give that value, or choose "
                     "another --out, in Python out=."
                 )
 
 
 def _status(folder: pathlib.Path, trainings: Sequence[Training]) -> SweepStatus:
-    """The state of a sweep with these trainings, which are written to its folder."""
-    sources.write(folder, trainings)
+    """The state of a sweep with these trainings."""
     finished = [training for training in trainings if training.is_finished(folder)]
     return SweepStatus(finished, [training for training in trainings if training not in finished])
 
 
 def _loop(folder: pathlib.Path, status: SweepStatus, launcher: Launcher, report: Report, requests: Requests) -> None:
-    while status.waiting or status.running:
-        while status.waiting and launcher.room:
-            training = status.waiting.pop(0)
+    while True:
+        while launcher.room > 0 and (training := status.take(folder)):
             launcher.start(training)
             status.running[training.name] = training
         for name, code in launcher.ended().items():
@@ -180,18 +195,23 @@ def _loop(folder: pathlib.Path, status: SweepStatus, launcher: Launcher, report:
             launcher.stop()
             finished = status.finished + [each for each in status.running.values() if each.is_finished(folder)]
             done = f"{len(finished)} of {status.count}"  # some finish while they are asked to stop
-            raise Stopped(
-                f"stopped with {done} trainings finished; `beliefrl sweep --out {folder}` continues.", requests.number
-            )
+            go_on = f"`beliefrl sweep --out {shlex.quote(str(folder))}` continues."
+            raise Stopped(f"stopped with {done} trainings finished; {go_on}", requests.number)
+        if not (status.waiting or status.running):
+            return
         time.sleep(LOOK_EVERY)
 
 
 def reason(log: pathlib.Path, code: int) -> str:
-    """Why a training failed: its last error message, or else the last line of its output, in this session."""
+    """Why a training failed: its last error message, a signal, or the last line of its output, in this session."""
     _, _, output = log.read_text(errors="replace").rpartition(places.BEGIN)
     lines = [line.strip() for line in output.splitlines() if line.strip()]
-    messages = [line.removeprefix("beliefrl: ") for line in lines if line.startswith("beliefrl: ")] or lines
-    return messages[-1] if messages else f"it ended with code {code} and printed nothing"
+    messages = [line.removeprefix("beliefrl: ") for line in lines if line.startswith("beliefrl: ")]
+    if code < 0 and not messages:
+        names = {each.value: each.name for each in signal.Signals}
+        advice = " (often too little memory: give fewer --workers)" if -code == signal.SIGKILL else ""
+        return f"it was killed by {names.get(-code, f'signal {-code}')}{advice}"
+    return (messages or lines or [f"it ended with code {code} and printed nothing"])[-1]
 
 
 def lock(folder: pathlib.Path) -> Any:

@@ -9,16 +9,18 @@ import importlib.util
 import json
 import os
 import pathlib
+import sys
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from beliefrl.runs.arrays import write_whole
 from beliefrl.sweeps.experiments import Experiment, grid
-from beliefrl.sweeps.plan import Training
+from beliefrl.sweeps.plan import OPTIONS, Training
 from beliefrl.types import UserError, plain, said
 
 PLAN = "sweep.json"  # in the folder of a sweep
+FORMAT = 1
 
 COMPARED = ("vrm", "sac-mlp", "sac-lstm", "slac")
 ABLATIONS = ("vrm", "vrm-single", "vrm-first", "vrm-keep", "vrm-deterministic")
@@ -121,11 +123,12 @@ def load(path: str | os.PathLike[str]) -> list[Experiment]:
     if spec is None or spec.loader is None:
         raise UserError(f"{path} is not a Python file: its name must end in .py.")
     module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look for their module there
     try:
         spec.loader.exec_module(module)
     except UserError:
         raise
-    except Exception as error:  # a user's file may raise anything
+    except (Exception, SystemExit) as error:  # a user's file may raise anything
         raise UserError(f"{path} cannot be run: {said(error)}.") from None
     found = getattr(module, "experiments", None)
     if not isinstance(found, list | tuple) or not all(isinstance(each, Experiment) for each in found):
@@ -139,12 +142,18 @@ def read(sweep: pathlib.Path) -> list[Training]:
     """The trainings of the sweep in a folder; an empty list if there is no sweep yet.
 
     Raises:
-        UserError: its sweep.json is damaged.
+        UserError: its sweep.json is damaged, or of another version.
     """
     path = sweep / PLAN
     try:
-        written = json.loads(path.read_text())["trainings"]
-        return [Training(**{**each, "observe": tuple(map(str, each["observe"]))}) for each in written]
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if content["format"] != FORMAT:
+            raise UserError(f"{path} has format {content['format']}, which this version cannot read: update beliefrl.")
+        written = content["trainings"]
+        trainings = [Training(**{**each, "observe": tuple(map(str, each["observe"]))}) for each in written]
+        for name in (name for each in trainings for name in each.options if name not in OPTIONS):
+            raise UserError(f"{path} was written by another version: this one has no option {name!r}.")
+        return trainings
     except FileNotFoundError:
         return []
     except (OSError, ValueError, KeyError, TypeError):
@@ -153,5 +162,5 @@ def read(sweep: pathlib.Path) -> list[Training]:
 
 def write(sweep: pathlib.Path, trainings: Sequence[Training]) -> None:
     """Write the trainings of a sweep to its sweep.json."""
-    content = {"format": 1, "trainings": [dataclasses.asdict(training) for training in trainings]}
+    content = {"format": FORMAT, "trainings": [dataclasses.asdict(training) for training in trainings]}
     write_whole(sweep / PLAN, (json.dumps(plain(content), indent=1) + "\n").encode())

@@ -6,6 +6,7 @@ Optuna's journal is a file of JSON lines. Only the process that has locked the f
 import contextlib
 import dataclasses
 import math
+import os
 import pathlib
 import statistics
 import warnings
@@ -166,7 +167,7 @@ def _repair(path: pathlib.Path) -> None:
     if path.exists():
         content = path.read_bytes()
         if not content.endswith(b"\n"):
-            path.write_bytes(content[: content.rfind(b"\n") + 1])
+            os.truncate(path, content.rfind(b"\n") + 1)  # a full disk cannot lose the rest
 
 
 def _check_same(folder: pathlib.Path, recorded: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
@@ -178,15 +179,16 @@ def _check_same(folder: pathlib.Path, recorded: Mapping[str, Any], asked: Mappin
             raise UserError(f"The study in {folder} has another {shown}; choose another --out, in Python out=.")
 
 
-def running(study: Any) -> list[tuple[Any, dict[str, Any]]]:
-    """The trials that were stopped, with their settings. They can be continued.
+def running(study: Any) -> dict[str, tuple[Any, dict[str, Any]]]:
+    """The trials that were stopped, with their settings, by name. They can be continued.
 
     A trial without settings was stopped before its training began. It counts as failed.
     """
-    package, found = optuna(), []
+    package, found = optuna(), {}
     for trial in study.get_trials(states=(package.trial.TrialState.RUNNING,)):
         if "settings" in trial.user_attrs:
-            found.append((package.trial.Trial(study, trial._trial_id), trial.user_attrs["settings"]))
+            going = package.trial.Trial(study, trial._trial_id)
+            found[name_of(trial.number)] = going, trial.user_attrs["settings"]
         else:
             study.tell(trial.number, state=package.trial.TrialState.FAIL)
     return found

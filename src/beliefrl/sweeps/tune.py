@@ -12,16 +12,16 @@ Optuna, and stops the trials that Optuna prunes. A tune's folder:
 import dataclasses
 import os
 import pathlib
-import re
 import shlex
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, get_args
 
 from beliefrl.agents.hyperparameters import Ranges
+from beliefrl.runs.cached import CachedRun
+from beliefrl.runs.folder import folder_name
 from beliefrl.runs.given_files import as_path
 from beliefrl.runs.options import Options
-from beliefrl.runs.run import Run
 from beliefrl.sweeps import places, ranges, study
 from beliefrl.sweeps.experiments import Experiment
 from beliefrl.sweeps.plan import Training
@@ -32,7 +32,7 @@ from beliefrl.training.stop import Requests, Stopped
 from beliefrl.types import UserError, check_whole, short
 
 LOOK_EVERY = 1.0  # seconds
-PATIENCE = 3  # failures, without any other trial, after which tuning ends
+PATIENCE = 3  # trainings that fail one after the other, after which tuning ends
 STOPPED = (130, 143, -2, -15)  # exit codes of a training that was asked to stop, the last two before it began
 
 
@@ -105,9 +105,9 @@ def tune(
     experiment = Experiment(agent, task, settings or {}, range(seed, seed + seeds), observe, constants or {})
     search = Search(experiment, ranges or {}, only, objective, actions)
     study.optuna()  # raises an error if it is not installed
-    folder = as_path(out or pathlib.Path("runs") / re.sub(r"[^\w.-]+", "-", f"tune-{agent}-{task}"))
-    _check_folder(folder)
+    folder = as_path(out or pathlib.Path("runs") / folder_name(f"tune-{agent}-{task}"))
     with writing(folder):
+        _check_folder(folder)
         return _run(folder, search, trials, prune, workers, progress)
 
 
@@ -121,16 +121,18 @@ def _run(folder: pathlib.Path, search: Search, trials: int, prune: bool, workers
         with reporting(folder, None, progress) as listen, Requests(confirm) as requests:
             try:
                 loop = _Loop(folder, recorded, search, launcher, status, stopped)
-                while status.waiting or status.running:
+                while True:
                     loop.step()
                     listen(status)
                     if requests.number:
                         launcher.stop()
-                        loop.collect()
+                        loop.collect(all_stopped=True)
                         done = f"{len(status.finished) + len(status.pruned)} of {status.count}"
                         raise Stopped(
                             f"stopped with {done} trials done in {folder}; the same command continues.", requests.number
                         )
+                    if not (status.waiting or status.running):
+                        break
                     time.sleep(LOOK_EVERY)
             finally:
                 launcher.stop()
@@ -178,14 +180,16 @@ def _status(recorded: Any, base: Training, trials: int) -> SweepStatus:
 def _result(folder: pathlib.Path, search: Search, begun: Sequence[Trial]) -> Tuned:
     complete = sorted((each for each in begun if each.state == "complete"), key=lambda each: each.value, reverse=True)
     if not complete:
-        raise UserError(f"No trial in {folder} is complete: give more trials, or see {folder}/logs for the causes.")
+        why = next((f" ({trial.why.rstrip('.')})" for trial in begun if trial.why), "")
+        raise UserError(
+            f"No trial in {folder} is complete{why}: give more trials; {folder}/logs has what they printed."
+        )
     best = search.training(complete[0].name, complete[0].settings)
     fresh = best.options | {"seed": best.options["seed"] + best.options["seeds"]}
-    command = dataclasses.replace(best, options=fresh).command(folder)[:-3]  # without --out and --resume
     return Tuned(
         settings=best.settings,
         value=complete[0].value,
-        command=shlex.join(["beliefrl", *command]),
+        command=shlex.join(["beliefrl", *dataclasses.replace(best, options=fresh).arguments()]),
         run=folder / best.name,
         study=folder / study.JOURNAL,
         trials=(*complete, *(trial for trial in begun if trial.state != "complete")),
@@ -202,33 +206,33 @@ class _Loop:
         search: Search,
         launcher: places.Local,
         status: SweepStatus,
-        stopped: list[tuple[Any, dict[str, Any]]],
+        stopped: dict[str, tuple[Any, dict[str, Any]]],
     ):
-        """`stopped` are the trials to continue, with their settings; they are the first that wait in `status`."""
+        """`stopped` are the trials to continue, with their settings, by name; they wait in `status`."""
         self.folder, self.study, self.search, self.launcher = folder, recorded, search, launcher
         self.status, self.stopped = status, stopped
         self.trials: dict[str, Any] = {}  # the running ones
         self.reported: dict[str, set[int]] = {}  # their evaluations that Optuna knows
         self.is_poor: set[str] = set()  # names of the trials that are pruned
+        self.failures = 0  # since the last trial that did not fail
 
     def step(self) -> None:
         """Start what there is room for, and look after the running trials."""
-        while self.status.waiting and self.launcher.room:
-            self._begin()
+        while self.launcher.room > 0 and (waiting := self.status.take(self.folder)):
+            self._begin(waiting.name)
         self.collect()
         for name in self.status.running:
             self._watch(name)
 
-    def _begin(self) -> None:
-        waiting = self.status.waiting.pop(0)
-        if self.stopped:
-            trial, settings = self.stopped.pop(0)
+    def _begin(self, name: str) -> None:
+        """Continue a trial that was stopped, or begin a new one."""
+        if name in self.stopped:
+            trial, settings = self.stopped.pop(name)
         else:
             trial = self.study.ask()
             settings = ranges.draw(trial, self.search.ranges)
             trial.set_user_attr("settings", settings)
-        name = study.name_of(trial.number)
-        assert name == waiting.name
+        assert name == study.name_of(trial.number)
         self.status.notes[name] = " ".join(f"{field}={value}" for field, value in settings.items())
         try:
             training = self.search.training(name, settings)
@@ -244,7 +248,7 @@ class _Loop:
         trial, steps = self.trials[name], self.status.running[name].steps
         if name in self.is_poor or not (self.folder / name / "config.json").exists():
             return
-        run = Run(self.folder / name)
+        run = CachedRun(self.folder / name)
         if any(map(run.has_diverged, run.seeds)):
             self.is_poor.add(name)
             self.launcher.interrupt(name)
@@ -260,33 +264,36 @@ class _Loop:
                     self.launcher.interrupt(name)
                     return
 
-    def collect(self) -> None:
-        """Record the trials that have ended."""
+    def collect(self, all_stopped: bool = False) -> None:
+        """Record the trials that have ended. `all_stopped`: all were asked to stop, and can be continued."""
         states = study.optuna().trial.TrialState
         for name, code in self.launcher.ended().items():
             training, trial = self.status.running.pop(name), self.trials.pop(name)
-            run = Run(self.folder / name) if (self.folder / name / "config.json").exists() else None
+            run = CachedRun(self.folder / name) if (self.folder / name / "config.json").exists() else None
             diverged = run is not None and any(map(run.has_diverged, run.seeds))
             returns = [] if run is None else list(self.search.returns(run).values())
             if diverged or (code and name in self.is_poor):
+                self.failures = 0
                 self.study.tell(trial, state=states.PRUNED)
                 self.status.notes[name] = "a seed diverged" if diverged else "its return was low"
                 self.status.pruned.append(training)
             elif code == 0 and returns:
-                value = self.search.value(returns)
+                self.failures, value = 0, self.search.value(returns)
                 self.study.tell(trial, value)
                 self.status.notes[name] = f"objective {value:.1f}"
                 self.status.finished.append(training)
-            elif code in STOPPED:  # it continues now if only this trial was stopped, or else in the next session
+            elif all_stopped or code in STOPPED:  # if only this trial was stopped, it continues now
                 self.status.waiting.insert(len(self.stopped), training)
-                self.stopped.append((trial, trial.user_attrs["settings"]))
+                self.stopped[name] = trial, trial.user_attrs["settings"]
             else:
-                self._failed(name, trial, reason(self.folder / "logs" / f"{name}.log", code))
+                why = reason(self.folder / "logs" / f"{name}.log", code)
+                self._failed(name, trial, why)
+                self.failures += 1
+                if self.failures >= PATIENCE:
+                    logs = f"fix the cause; {self.folder}/logs has the output of each"
+                    raise UserError(f"The last {self.failures} trials failed ({why.rstrip('.')}): {logs}.")
 
     def _failed(self, name: str, trial: Any, why: str) -> None:
         trial.set_user_attr("why", why)
         self.study.tell(trial, state=study.optuna().trial.TrialState.FAIL)
         self.status.failed[name] = why
-        if len(self.status.failed) >= PATIENCE and not (self.status.finished or self.status.pruned):
-            logs = f"fix the cause; {self.folder}/logs has the output of each"
-            raise UserError(f"The first {len(self.status.failed)} trials failed ({why.rstrip('.')}): {logs}.")

@@ -1,6 +1,7 @@
 """Checks of `train` and `resume`, before anything is changed. Each raises a UserError."""
 
 import dataclasses
+import shlex
 from typing import Any
 
 from beliefrl import tasks
@@ -68,8 +69,8 @@ def same(run: Run, config: dict[str, Any], older: dict[str, Any]) -> None:
     for name, value in asked.items():
         if there.get(name, value) != value:
             raise UserError(
-                f"{run.folder} was trained with {name}={there[name]}, not {value}: choose another --out, in Python "
-                f"out=. `beliefrl resume {run.shown}` continues it with its own settings."
+                f"{run.shown} was trained with {name}={there[name]}, not {value}: choose another --out, in Python "
+                f"out=. `beliefrl resume {shlex.quote(run.shown)}` continues it with its own settings."
             )
 
 
@@ -85,7 +86,7 @@ def same_task(run: Run, task: Any) -> None:
         if name == "task":
             ours, theirs = (each.rpartition(":")[2] for each in (ours, theirs))
         if ours != theirs:
-            raise UserError(f"{run.folder} was trained with {name}={there[name]}, not {asked[name]}: give that task.")
+            raise UserError(f"{run.shown} was trained with {name}={there[name]}, not {asked[name]}: give that task.")
 
 
 def about_task(config: dict[str, Any]) -> dict[str, Any]:

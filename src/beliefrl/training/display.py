@@ -152,7 +152,7 @@ def _mean(mode: dict[str, Any]) -> str:
 
 def run_table(run: Run, agent: Any) -> Table:
     """The settings of a run, and its progress. Without an agent all of its settings are shown."""
-    table = Table(title=Text(str(run.folder)), title_justify="left", show_header=False)
+    table = Table(title=Text(run.shown), title_justify="left", show_header=False)
 
     def add(name: str, value: str) -> None:
         table.add_row(name, Text(value))  # without markup: it may contain brackets

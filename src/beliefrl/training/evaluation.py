@@ -67,7 +67,7 @@ def evaluate(
     trained, found, states, precision = restore(run, task, agent, best)
     lost = np.flatnonzero(~np.asarray(log.finite(states))).tolist()
     if len(lost) == len(run.seeds):
-        raise UserError(f"All seeds of {run.folder} diverged before their first evaluation, so it has no agent.")
+        raise UserError(f"All seeds of {run.shown} diverged before their first evaluation, so it has no agent.")
     keep_compiled()
     keys = jax.random.split(jax.random.key(seed), len(run.seeds))
     with _showing(progress, 2 * episodes * len(run.seeds)) as ended, jax.default_matmul_precision(precision):

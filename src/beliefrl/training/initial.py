@@ -65,7 +65,7 @@ def taken(options: Options, agent: Agent, spec: Spec) -> tuple[dict[str, np.ndar
     _refuse_untrained(source, agent, [ends[at] for at in index])
     session = sessions(source.config)[-1]
     origin = {
-        "run": str(source.folder),
+        "run": source.shown,
         "agent": source.config["agent"],
         "task": source.config["task"],
         "git_commit": session.get("git_commit"),
@@ -126,7 +126,7 @@ def _refuse_untrained(source: Run, agent: Agent, ends: list[dict[str, Any] | Non
     for end in ends:
         if end is not None and end["step"] <= explored:
             raise UserError(
-                f"{source.folder} cannot be init_from: its agent was saved at step {end['step']:,}, before the "
+                f"{source.shown} cannot be init_from: its agent was saved at step {end['step']:,}, before the "
                 "pre-training; train it for more steps."
             )
 
@@ -142,7 +142,7 @@ def _refuse_other_settings(source: Run, agent: Agent) -> None:
         here, there = plain(getattr(agent, name, absent)), plain(recorded.get(name, absent))
         if bool(here) != bool(there) or (absent == () and here != there):
             raise UserError(
-                f"{source.folder} cannot be init_from: it was trained with {name}={there}, and this training "
+                f"{source.shown} cannot be init_from: it was trained with {name}={there}, and this training "
                 f"has {here}; set {name}={there}."
             )
 
@@ -162,7 +162,7 @@ def _fitting(source: Run, saved: dict[str, np.ndarray], agent: Agent, spec: Spec
         here = f"the shape {wanted[name].shape}" if name in wanted else "no such array"
         if there != here:
             raise UserError(
-                f"{source.folder} ({source.config['agent']} on {source.config['task']}) cannot be init_from: its "
+                f"{source.shown} ({source.config['agent']} on {source.config['task']}) cannot be init_from: its "
                 f"{name.lstrip('.')} has {there}, this training's has {here}; the networks must be the same."
             )
     return {name: saved[name] for name in wanted}

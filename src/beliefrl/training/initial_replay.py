@@ -58,7 +58,7 @@ def taken(options: Options, agent: Agent, task: Any, seeds: list[int]) -> tuple[
     newest = {jax.tree_util.keystr(where): _newest(ring, seeds, count, kept) for where, ring in named}
     if not all(np.isfinite(ring).all() for ring in newest.values()):
         raise UserError(
-            f"init_replay is impossible: the replay of {source.folder} has numbers that are not finite, because a seed "
+            f"init_replay is impossible: the replay of {source.shown} has numbers that are not finite, because a seed "
             "diverged. Take other seeds, or leave init_replay out."
         )
     return newest | {ADDED: kept.astype(np.int32)}, {"replay_step": step, "timesteps": int(kept.max())}
@@ -94,7 +94,7 @@ def _same(source: Run, agent: Agent, task: Any, envs: int) -> None:
     for name, value in ({name: here[name] for name in names} | noted).items():
         if plain(there.get(name, value)) != plain(value):
             raise UserError(
-                f"init_replay is impossible: {source.folder} was trained with {name}={there[name]}, and this training "
+                f"init_replay is impossible: {source.shown} was trained with {name}={there[name]}, and this training "
                 f"has {value}. Use the same, or leave init_replay out."
             )
 

@@ -5,6 +5,7 @@ A run's folder is data: a class of a user that only the folder names is never im
 
 import contextlib
 import os
+import shlex
 from collections.abc import Iterator
 from typing import Any
 
@@ -50,7 +51,7 @@ def _states(run: Run, agent: Agent, spec: Spec, best: bool) -> Any:
 def check_interface(run: Run, task: Any) -> None:
     """Raise a UserError if a Gymnasium environment has other entries or actions than in the training of a run."""
     if isinstance(task, GymnasiumTask):
-        task.interface.check(run.config.get("interface"), str(run.folder))
+        task.interface.check(run.config.get("interface"), run.shown)
 
 
 def restore_seed(
@@ -99,14 +100,14 @@ def restore_policy(
 def _check_seed(run: Run, seed: int | None) -> None:
     """Raise a UserError if the run does not have this seed."""
     if seed is not None and seed not in run.seeds:
-        raise UserError(f"{run.folder} has no seed {seed}: it has {', '.join(map(str, run.seeds))}.")
+        raise UserError(f"{run.shown} has no seed {seed}: it has {', '.join(map(str, run.seeds))}.")
 
 
 def _of_seed(run: Run, states: Any, seed: int | None) -> Any:
     index = 0 if seed is None else run.seeds.index(seed)
     chosen = jax.tree.map(lambda leaf: leaf[index], states)
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(chosen)):
-        which = f"Seed {run.seeds[index]} of {run.folder}"
+        which = f"Seed {run.seeds[index]} of {run.shown}"
         raise UserError(f"{which} has diverged before its first evaluation, so it has no agent: give another seed.")
     return chosen
 
@@ -125,11 +126,11 @@ def agent_of(run: Run, agent: Agent | type | None = None) -> Agent:
     name = run.config["agent"]
     if agent is None and agents.is_own(name):
         shown = one_line(name)
-        raise UserError(f"{run.folder} was trained by {shown}: give --agent {shown}, or in Python agent=.")
+        raise UserError(f"{run.shown} was trained by {shown}: give --agent {shown}, or in Python agent=.")
     if agent is not None:
         kind = agents.check_class(agent if isinstance(agent, type) else type(agent))
         if not agents.is_of(kind, name):
-            raise UserError(f"{run.folder} was trained by {one_line(name)}, not by {path(kind)}: give that agent.")
+            raise UserError(f"{run.shown} was trained by {one_line(name)}, not by {path(kind)}: give that agent.")
     with _naming(run):
         like = agents.named(name) if agent is None or name in agents.AGENTS else agent
         return hyperparameters.restored(like, run.config["hyperparameters"])
@@ -138,7 +139,8 @@ def agent_of(run: Run, agent: Agent | type | None = None) -> Agent:
 def as_argument(run: Run) -> str:
     """A run as the argument of a command: its folder, and --agent if the run has a user's own agent."""
     name = run.config["agent"]
-    return f"{run.shown} --agent {one_line(name)}" if agents.is_own(name) else run.shown
+    folder = shlex.quote(run.shown)
+    return f"{folder} --agent {one_line(name)}" if agents.is_own(name) else folder
 
 
 def task_of(run: Run | str | os.PathLike[str], task: Task | GymnasiumTask | type | None = None) -> Any:
@@ -159,16 +161,16 @@ def task_of(run: Run | str | os.PathLike[str], task: Task | GymnasiumTask | type
         shown, before = map(_entries, (asked, there))
         if asked["observe"] != there["observe"] or {shown, before} == set(MASKS.values()):
             given = f"and the given task shows {shown}: give {before}."
-            raise UserError(f"{run.folder} was trained on {before} of the observation, {given}")
+            raise UserError(f"{run.shown} was trained on {before} of the observation, {given}")
         now, before = (each["steps_per_action"] for each in (asked, there))
         if now != before:
             given = f"and the given task has {now}: give the same (beliefrl.with_action_repeat)."
-            raise UserError(f"{run.folder} was trained with steps_per_action={before}, {given}")
+            raise UserError(f"{run.shown} was trained with steps_per_action={before}, {given}")
         return made
     name, constants = run.config["task"], tuples(run.config["constants"])
     if not tasks.knows(name):
         raise UserError(
-            f"{run.folder} was trained on {name}, which has no registered name: in Python, give it with task=. The "
+            f"{run.shown} was trained on {name}, which has no registered name: in Python, give it with task=. The "
             "command line needs a registered name."
         )
     with _naming(run):

@@ -159,15 +159,16 @@ def _go_on(
     progress: bool,
 ) -> Run:
     """Continue a training; `changes` are its new options, `listeners` are `report` and `callback`."""
-    folder, made_by = run.folder, agent_of(run, agent)
+    folder, shown, made_by = run.folder, run.shown, agent_of(run, agent)
     if all(map(run.has_diverged, run.seeds)):  # another try would select the seeds that survive
-        raise UserError(f"All seeds of {folder} have diverged: train with other settings, and with another --out.")
+        raise UserError(f"All seeds of {shown} have diverged: train with other settings, and with another --out.")
     begins_again = not was_ever_written(folder) and not _is_finished(run)
     if not (begins_again or listed(folder)):
-        raise UserError(f"{folder} has no usable checkpoint left: train again, with another --out.")
+        raise UserError(f"{shown} has no usable checkpoint left: train again, with another --out.")
     _ = Options(**_options(run) | changes)  # raise before the folder is locked
     with contextlib.ExitStack() as showing, contextlib.ExitStack() as stack:
         recorder = stack.enter_context(Recorder(folder, None))
+        recorder.shown = shown
         made = task_of(recorder, task)
         if task is not None:
             checks.same_task(recorder, made)
@@ -175,7 +176,7 @@ def _go_on(
         before = _options(recorder)
         steps = changes.get("steps", before["steps"])
         if steps < before["steps"]:
-            raise UserError(f"steps={steps} is impossible: {folder} trains for {before['steps']}, and may only grow.")
+            raise UserError(f"steps={steps} is impossible: {shown} trains for {before['steps']}, and may only grow.")
         options = Options(**before | changes)
         if options.stop_at is None and "stop_patience" not in changes:
             options = dataclasses.replace(options, stop_patience=1)
@@ -280,5 +281,5 @@ def _options(run: Run) -> dict[str, Any]:
     known = {field.name for field in dataclasses.fields(Options)}
     for name in run.config["options"]:
         if name not in known:
-            raise UserError(f"{run.folder} was trained by another version: this one has no option {name!r}.")
+            raise UserError(f"{run.shown} was trained by another version: this one has no option {name!r}.")
     return {"steps": Options.steps} | tuples(run.config["options"])

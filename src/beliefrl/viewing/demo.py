@@ -6,6 +6,7 @@ makes these files.
 
 import os
 import pathlib
+import shutil
 import zipfile
 
 from beliefrl.runs.given_files import as_path
@@ -37,10 +38,19 @@ def demo(task: str, folder: str | os.PathLike[str]) -> Run:
     folder = as_path(folder)
     try:
         folder.mkdir(parents=True)
-        with zipfile.ZipFile(FOLDER / f"{task}.zip") as packed:
-            packed.extractall(folder)
+        _unpack(FOLDER / f"{task}.zip", folder)
     except FileExistsError:
         raise UserError(f"{folder} exists already: choose another folder.") from None
     except OSError as error:
         raise UserError(f"{folder} cannot be made ({cause(error)}): choose another folder.") from None
     return Run(folder)
+
+
+def _unpack(path: pathlib.Path, folder: pathlib.Path) -> None:
+    """Unpack a zip file into a new folder, or remove the folder."""
+    try:
+        with zipfile.ZipFile(path) as packed:
+            packed.extractall(folder)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise

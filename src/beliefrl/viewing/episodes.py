@@ -195,7 +195,7 @@ def make_env(of: Run | str | os.PathLike[str] | Task | GymnasiumTask | type) -> 
         run = of if isinstance(of, Run) else Run(cast(Any, of))
         if not tasks.knows(run.config["task"]):
             raise UserError(
-                f"{run.folder} was trained on {run.config['task']}, a task of your own: give make_env the task."
+                f"{run.shown} was trained on {run.config['task']}, a task of your own: give make_env the task."
             )
         task = task_of(run)
         check_interface(run, task)

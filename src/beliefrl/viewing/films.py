@@ -1,15 +1,13 @@
 """Videos and film strips of trained agents.
 
-A video is an mp4 file (encoded by imageio-ffmpeg, extra `video`), a GIF (encoded by Pillow), or shown in a window (by
-pygame, extra `render`). A film strip has one row of frames per run, evenly spaced in time (Appendix "Visualization of
-Trained Agents").
+A video is an mp4 file or a GIF (`encoders`), or shown in a window (by pygame, extra `render`). A film strip has one row
+of frames per run, evenly spaced in time (Appendix "Visualization of Trained Agents").
 """
 
 import functools
 import math
 import os
 import pathlib
-import subprocess
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -20,18 +18,17 @@ from PIL import Image, ImageDraw, ImageFont
 
 from beliefrl.agents import Agent, is_own
 from beliefrl.analysis import figures
-from beliefrl.runs.arrays import replacing
 from beliefrl.runs.given_files import check_folder
 from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.drawing import INK, PAPER, Viewer
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.restore import restore_seed
-from beliefrl.types import LARGEST, UserError, cause, check_whole
+from beliefrl.types import LARGEST, UserError, check_whole
+from beliefrl.viewing.encoders import Writer, encoder
 from beliefrl.viewing.episodes import Frame, Pixels, Player, Trajectory, check_episode, pace_of
 
 FASTEST = 50.0  # frames per second that GIFs and screens can show
-Writer = Callable[[Pixels], None]
 
 
 def video(
@@ -78,7 +75,7 @@ def video(
             raise UserError(f"{name}={rate!r} is impossible: it must be a number above 0 and up to 1000.")
     show = _window
     if path is not None:  # absolute: an environment may change the working directory
-        show = functools.partial(_encoder, pathlib.Path(path).absolute(), kind_of(pathlib.Path(path)))
+        show = functools.partial(encoder, pathlib.Path(path).absolute(), kind_of(pathlib.Path(path)))
     with Player(*restore_seed(run, seed, task, agent, best), rendered=True) as player:
         pace = pace_of(player.environment)
         every = 1 if fps else math.ceil(pace / fastest)
@@ -146,71 +143,6 @@ def caption(pixels: Pixels, text: str) -> UInt8[np.ndarray, "taller wider 3"]:
     return np.array(image)
 
 
-@contextmanager
-def _encoder(path: pathlib.Path, kind: str, fps: float) -> Iterator[Writer]:
-    """A function that adds a frame to the video."""
-    write, shapes = {".mp4": _mp4, ".gif": _gif}[kind], set()
-    try:
-        with replacing(path) as temporary, write(temporary, fps) as add:
-
-            def checked(pixels: Pixels) -> None:
-                shapes.add(pixels.shape)
-                if len(shapes) > 1:
-                    raise UserError("The environment renders frames of different sizes: all must have the same size.")
-                add(pixels)
-
-            yield checked
-    except OSError as error:
-        raise UserError(f"{path} cannot be written ({cause(error)}): choose another file.") from None
-
-
-@contextmanager
-def _mp4(path: pathlib.Path, fps: float) -> Iterator[Writer]:
-    """Encode as H.264, which any player shows; each frame is piped to ffmpeg."""
-    import imageio_ffmpeg  # pyright: ignore[reportMissingImports]
-
-    # imageio-ffmpeg's own writer forks this process. That may hang, since JAX runs threads in it.
-    codec = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "18"]
-    encoding = [*codec, "-movflags", "+faststart", "-f", "mp4", str(path)]
-    encoder: Any = None
-
-    def add(pixels: Pixels) -> None:
-        nonlocal encoder
-        if encoder is None:
-            size = f"{pixels.shape[1]}x{pixels.shape[0]}"
-            given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", f"{fps}", "-i", "-"]
-            command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-y", *given, *encoding]
-            pipe = subprocess.PIPE  # so Ctrl-C does not reach ffmpeg
-            encoder = subprocess.Popen(command, stdin=pipe, stderr=pipe, start_new_session=True)
-        encoder.stdin.write(pixels.tobytes())
-
-    try:
-        yield add
-        message = encoder.communicate()[1].decode(errors="replace").strip()
-        if encoder.returncode:
-            raise OSError(message)
-    finally:
-        if encoder is not None and encoder.poll() is None:
-            encoder.kill()
-            encoder.communicate()
-
-
-@contextmanager
-def _gif(path: pathlib.Path, fps: float) -> Iterator[Writer]:
-    """Keep all frames, reduced to 256 colours, and encode them at the end."""
-    frames: list[Image.Image] = []
-    yield lambda pixels: frames.append(_reduced(Image.fromarray(pixels)))
-    delay = max(2, round(100 / fps)) * 10  # milliseconds, a multiple of 10 as GIF requires
-    frames[0].save(path, "GIF", save_all=True, append_images=frames[1:], duration=delay, loop=0)
-
-
-def _reduced(image: Image.Image) -> Image.Image:
-    """The image with at most 256 colours. An octree is fast, and good enough for drawings of few colours."""
-    drawn = image.getcolors(maxcolors=1024) is not None
-    method = Image.Quantize.FASTOCTREE if drawn else Image.Quantize.MEDIANCUT
-    return image.quantize(method=method, dither=Image.Dither.NONE)
-
-
 def film(
     runs: Sequence[Run | str | os.PathLike[str]] | Run | str | os.PathLike[str],
     path: str | os.PathLike[str] | None = None,
@@ -255,13 +187,14 @@ def film(
     given = runs if isinstance(runs, Iterable) and not isinstance(runs, str) else [runs]
     runs = [run if isinstance(run, Run) else Run(run) for run in given]
     path = pathlib.Path(path or runs[0].folder / "film.png")
-    figures.paths(path)
+    png, place = figures.paths(path)[0], path.absolute()  # an environment may change the working directory
     own = [agent if is_own(run.config["agent"]) else None for run in runs]
     rows = [
         _strip(run, restore_seed(run, seed, task, made_by, best), frames, start, (episode_seed, sampled, steps))
         for run, made_by in zip(runs, own, strict=True)
     ]
-    return figures.save(_draw_strips(runs, rows), path)
+    figures.save(_draw_strips(runs, rows), place)
+    return png
 
 
 def _strip(
@@ -271,7 +204,7 @@ def _strip(
     with Player(*restored, rendered=True) as player:
         length = len(player.play(*episode).steps.reward) - 1
         if start >= length:
-            raise UserError(f"start={start} is impossible: the episode of {run.folder} ends at step {length}.")
+            raise UserError(f"start={start} is impossible: the episode of {run.shown} ends at step {length}.")
         at = {round(time) for time in np.linspace(start, length, frames)}
         return player.play(*episode, at)
 

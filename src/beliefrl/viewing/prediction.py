@@ -145,7 +145,7 @@ def _model(run: Run, agent: Any, model: str | None) -> str:
     """The name of the model to predict with."""
     if not isinstance(agent, Predictive):
         raise UserError(
-            f"{run.folder} is a run of {run.config['agent']}, which offers no predictions: "
+            f"{run.shown} is a run of {run.config['agent']}, which offers no predictions: "
             "use predictive-sac, vrm or slac."
         )
     if model is not None and model not in agent.predictors:
