@@ -229,10 +229,10 @@ def left_out(runs: Sequence[Run], shown: Sequence[Group]) -> list[str]:
     whose curve ends before the last evaluation of its longest seed.
     """
     counted = {(run.folder, seed) for group in shown for run, seed in group.seeds}
-    missing = {run.folder: [seed for seed in run.seeds if (run.folder, seed) not in counted] for run in runs}
+    missing = [(run.shown, [seed for seed in run.seeds if (run.folder, seed) not in counted]) for run in runs]
     twice = [
         f"left out: {folder}, seed {' '.join(map(str, seeds))}: another run has the same settings and seed"
-        for folder, seeds in missing.items()
+        for folder, seeds in missing
         if seeds
     ]
     without = [

@@ -121,8 +121,8 @@ def last_rows(log: pathlib.Path) -> list[Row]:
     return [row for row in rows if row is not None]
 
 
-def damage(log: pathlib.Path) -> str | None:
-    """A sentence about the damaged lines of a log; None if there are none.
+def damage(log: pathlib.Path, shown: str) -> str | None:
+    """A sentence about the damaged lines of a log, which it calls `shown`; None if there are none.
 
     Raises:
         UserError: the log cannot be read.
@@ -131,8 +131,8 @@ def damage(log: pathlib.Path) -> str | None:
     if not damaged:
         return None
     if len(damaged) == 1:
-        return f"Line {damaged[0]} of {log} is damaged and left out."
-    return f"{len(damaged)} lines of {log} are damaged and left out, the first is line {damaged[0]}."
+        return f"Line {damaged[0]} of {shown} is damaged and left out."
+    return f"{len(damaged)} lines of {shown} are damaged and left out, the first is line {damaged[0]}."
 
 
 def _row(line: str) -> Row | None:

@@ -99,11 +99,11 @@ class Run:
 
     def damage(self) -> list[str]:
         """One sentence for each log with damaged lines, and one if logs are missing."""
-        found = [records.damage(self._metrics(seed)) for seed in self.seeds]
+        found = [records.damage(self._metrics(seed), f"{self.shown}/metrics/seed-{seed}.jsonl") for seed in self.seeds]
         missing = [seed for seed in self.seeds if not self._metrics(seed).exists()]
         if missing:
             logs = f"the log of seed {missing[0]}" if len(missing) == 1 else f"the logs of {len(missing)} seeds"
-            found.append(f"{self.folder / 'metrics'} lacks {logs}: a seed without a log counts as not started.")
+            found.append(f"{self.shown}/metrics lacks {logs}: a seed without a log counts as not started.")
         return [sentence for sentence in found if sentence is not None]
 
     def last_rows(self, seed: int) -> list[Row]:
