@@ -72,6 +72,7 @@ CASES = [
     ("predictive-sac", "gamma", 0.1, RETURNS),
     ("predictive-sac", "trace_decay", 0.1, RETURNS),
     ("predictive-sac", "off_policy_trace", 0.0, RETURNS),
+    ("predictive-sac", "trace_per_dimension", True, RETURNS),
     ("predictive-sac", "pessimism", 0.0, RETURNS),
     ("predictive-sac", "critic_likelihood", 1.0, "critics targets"),
 ]

@@ -229,6 +229,16 @@ def q_low(one, two, pessimism):
     return pessimism * np.minimum(one, two) + (1 - pessimism) * (one + two) / 2
 
 
+def test_the_likeness_per_dimension_is_the_root_of_the_ratio():
+    keys = jax.random.split(jax.random.key(0), 5)
+    policies = [Policy(*0.3 * jax.random.normal(key, (2, 50, 3))) for key in keys[:2]]
+    action = jnp.tanh(0.5 * jax.random.normal(keys[2], (50, 3)))
+    whole, root = (np.asarray(double_q.likeness(*policies, action, each)) for each in (False, True))
+    assert (whole < 1).any()
+    assert (whole == 1).any()
+    np.testing.assert_allclose(root, whole ** (1 / 3), rtol=1e-4)
+
+
 @pytest.mark.parametrize(("pessimism", "likelihood"), [(1.0, 0.0), (0.25, 0.0), (0.25, 0.1)])
 def test_targets_mix_the_values_of_the_target_networks_by_how_likely_the_actions_are(pessimism, likelihood):
     controller, key, time = make(likelihood=likelihood), jax.random.key(3), 4

@@ -55,7 +55,9 @@ class PredictiveSACAgent(ControllerAgent):
     trace_decay: float = 0.95
     """λ of the critics' λ-returns, in [0, 1]. With 0, a target has one reward and the value of the next belief."""
     off_policy_trace: float = 0.5
-    """ω, in [0, 1]: at an action that the present policy would not choose, the trace is ωλ. With 1, it is always λ."""
+    """ω, in [0, 1]: at an action that the current policy would not choose, the trace is ωλ. With 1, it is always λ."""
+    trace_per_dimension: bool = False
+    """Use the geometric mean, over action dimensions, of the ratio in the traces. With many, they are then longer."""
     pessimism: float = 1.0
     """P, in [0, 1]. The actor and the targets use the smaller Q (1), the mean of the two (0), or a mixture."""
     train_interval_rl: int = 1
@@ -145,6 +147,7 @@ class PredictiveSACAgent(ControllerAgent):
         "critic_likelihood": 0.0,
         "observation_memory": (),
         "perceive_reward": True,
+        "trace_per_dimension": False,
     }
 
     def __post_init__(self) -> None:
@@ -273,9 +276,9 @@ class PredictiveSACAgent(ControllerAgent):
     def samples(
         self, state: State, windows: Window, belief: Float[Array, "time batch belief"], key: Key[Array, ""]
     ) -> tuple[Samples, Float[Array, ""]]:
-        """The transitions of windows with their targets; also the mean of min(1, π / b)."""
+        """The transitions of windows with their targets; also the mean of min(1, ρ)."""
         valid, s = reading.known_transitions(windows), standardise(state.scales.belief, belief)
-        traces = double_q.Traces(self.gamma, self.trace_decay, self.off_policy_trace)
+        traces = double_q.Traces(self.gamma, self.trace_decay, self.off_policy_trace, self.trace_per_dimension)
         step, b = windows.step, windows.note.policy
         y, likeness = double_q.critic_targets(state.controller, s, step, valid, b, key, traces, self.pessimism)
         return Samples(belief[:-1], step.prev_action[1:], y, valid), valid_mean(likeness, valid)

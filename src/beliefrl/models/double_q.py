@@ -5,7 +5,7 @@ Source: Haarnoja et al. 2019, Algorithm 1, with λ-returns as the targets (`retu
     Q_low = min_i Q_i + (1 - P) |Q_1 - Q_2| / 2
     V̄(s) = Q̄_low(s, ã)
     y_t  = r_t + γ (1 - terminated) ((1 - c_{t+1}) V̄(s_{t+1}) + c_{t+1} y_{t+1})
-    c_t  = λ (ω + (1 - ω) min(1, π(a_t|s_t) / b(a_t|s_t)))
+    c_t  = λ (ω + (1 - ω) min(1, ρ_t)),  ρ_t = π(a_t|s_t) / b(a_t|s_t), or its root of degree D
     e_i  = (Q_i(s, a) - y) / u
     J_Q  = E ½ e_i² + w (½ e_i² / σ_i² + log σ_i),  summed over i
     J_π  = E α log π(ã|s) - Q_low(s, ã) / u  +  regulariser · ½ E μ²
@@ -14,10 +14,11 @@ Source: Haarnoja et al. 2019, Algorithm 1, with λ-returns as the targets (`retu
 With the pessimism P = 1, Q_low is the smaller of the two Q, and with P = 0 it is their mean. The smaller one avoids
 values that are too high. But where the two disagree it is low, and the policy avoids what it has seldom tried.
 
-b is the policy that chose a. Where the present policy is less likely to choose a, the trace c is shorter, so the
+b is the policy that chose a. Where the current policy is less likely to choose a, the trace c is shorter, so the
 rewards after it count less. With ω = 0 a return ends at the first action that π would not choose. With ω = 1 all
 actions have the same trace. The ratio is that of Retrace (Munos et al. 2016). Retrace corrects with Q̄(s, a), this
-target with V̄(s), so it is biased where the policies differ.
+target with V̄(s), so it is biased where the policies differ. With D action dimensions the ratio is a product of D
+ratios, and with many it is nearly always small. Its root of degree D is their geometric mean.
 
 u is a running root mean square of y. The networks of the critics return Q / u. When u changes, their last layers are
 rescaled, so that Q stays the same (van Hasselt et al. 2016, without their mean). So one learning rate and one
@@ -145,14 +146,17 @@ def q_low(
     return jnp.minimum(one, two) + (1 - pessimism) / 2 * jnp.abs(one - two)
 
 
-def likeness(policy: Policy, behaviour: Policy, action: Float[Array, "*batch action"]) -> Float[Array, "*batch"]:
-    """min(1, π(a|s) / b(a|s)), from the densities before the tanh, because its derivative cancels.
+def likeness(
+    policy: Policy, behaviour: Policy, action: Float[Array, "*batch action"], per_dimension: bool = False
+) -> Float[Array, "*batch"]:
+    """min(1, ρ), from the densities before the tanh, because its derivative cancels.
 
     a is taken as at most `ACTION_MAX`. So the ratio is not exact where μ of a policy is beyond -7 or 7.
     """
     before = jnp.arctanh(jnp.clip(action, -ACTION_MAX, ACTION_MAX))
     pi, b = (gaussian_log_prob(before, each.mean, jnp.exp(each.log_sigma)) for each in (policy, behaviour))
-    return jnp.exp(jnp.minimum(jnp.sum(pi - b, axis=-1), 0.0))
+    log_ratio = jnp.mean(pi - b, axis=-1) if per_dimension else jnp.sum(pi - b, axis=-1)
+    return jnp.exp(jnp.minimum(log_ratio, 0.0))
 
 
 class Traces(NamedTuple):
@@ -161,6 +165,7 @@ class Traces(NamedTuple):
     gamma: float  # the discount γ
     decay: float  # λ
     off_policy: float  # ω: the trace is ωλ at an action that π would not choose
+    per_dimension: bool = False  # whether ρ is the root of degree D
 
 
 def critic_targets(
@@ -173,7 +178,7 @@ def critic_targets(
     traces: Traces,
     pessimism: float,
 ) -> tuple[Float[Array, "length batch"], Float[Array, "length batch"]]:
-    """y_t of the transitions between length + 1 timesteps, and min(1, π / b) there.
+    """y_t of the transitions between length + 1 timesteps, and min(1, ρ) there.
 
     Args:
         controller: its actor is π.
@@ -181,14 +186,15 @@ def critic_targets(
         valid: which pairs of neighbours are transitions. For the others y_t has no meaning.
         behaviour: b(a|s_t) at the timesteps.
         key: the randomness of ã.
-        traces: γ, λ and ω.
+        traces: γ, λ, ω and ρ.
         pessimism: P.
     """
     flat = belief.reshape(-1, belief.shape[-1])
     action, _, policy = sample(controller.actor, flat, key)
     value = (controller.unit.u * q_low(controller.targets, flat, action, pessimism)).reshape(belief.shape[:2])
     policy = jax.tree.map(lambda leaf: leaf.reshape(*belief.shape[:2], -1)[:-1], policy)
-    like = likeness(policy, jax.tree.map(lambda leaf: leaf[:-1], behaviour), step.prev_action[1:])
+    behaviour = jax.tree.map(lambda leaf: leaf[:-1], behaviour)
+    like = likeness(policy, behaviour, step.prev_action[1:], traces.per_dimension)
     trace = traces.decay * (traces.off_policy + (1 - traces.off_policy) * like)
     return lambda_returns(step, valid, value, trace, traces.gamma), like
 
