@@ -1,5 +1,6 @@
 """The command line: finds the command, shows help, and turns errors into exit codes."""
 
+import contextlib
 import os
 import sys
 from collections.abc import Sequence
@@ -49,8 +50,13 @@ and exit code 2.
 """
 
 
+def _say(message: str) -> None:
+    with contextlib.suppress(BrokenPipeError):  # the exit code tells, too
+        print("beliefrl:", message, file=sys.stderr)
+
+
 def _fail(message: str) -> NoReturn:
-    print("beliefrl:", message, file=sys.stderr)
+    _say(message)
     raise SystemExit(2)
 
 
@@ -66,6 +72,8 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def _flush() -> None:
     """Write what is buffered, or drop it if its reader has closed the pipe: Python would complain when it ends."""
+    if sys.stdout is None or sys.stdout.closed:
+        return
     try:
         sys.stdout.flush()
     except BrokenPipeError:
@@ -95,8 +103,7 @@ def _run(argv: Sequence[str]) -> None:
     except UserError as error:
         _fail(one_line(str(error)))
     except KeyboardInterrupt as stopped:
-        what = str(stopped) or "stopped; what was logged and saved until now is kept."
-        print(f"beliefrl: {what}", file=sys.stderr)
+        _say(str(stopped) or "stopped; what was logged and saved until now is kept.")
         raise SystemExit(getattr(stopped, "exit_code", 130)) from None
     except Exception as error:
         if isinstance(error, MemoryError | OverflowError) or "out of memory" in str(error).lower():

@@ -24,6 +24,7 @@ from beliefrl.errors import short as short
 
 LARGEST = 2**31 - 1  # integer in a compiled program
 WIDEST = 100_000  # layer or state of a network
+LAST_SEED = 2_000_000_000  # number of a seed
 
 
 def check_range(settings: Any, names: Sequence[str], low: int | float, high: int | float = LARGEST) -> None:

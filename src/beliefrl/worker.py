@@ -12,7 +12,7 @@ STOP_WITH_PARENT = 1  # prctl's PR_SET_PDEATHSIG
 
 
 def main(argv: list[str]) -> None:
-    """Train for the process PARENT, on the core CORE; `-` is any core."""
+    """Run a command of `beliefrl` for the process PARENT, on the core CORE; `-` is any core."""
     parent, core, *command = argv
     if core != "-":
         os.sched_setaffinity(0, {int(core)})  # before XLA counts the cores

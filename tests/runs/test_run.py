@@ -212,7 +212,6 @@ import json, pathlib, sys
 from beliefrl.training.restore import agent_of
 from beliefrl.runs.run import Run
 from beliefrl.training.summary import summary
-from beliefrl.training.restore import as_argument
 from beliefrl.training.rollout import Episode
 from beliefrl.types import UserError
 config = json.loads(pathlib.Path("config.json").read_text())

@@ -57,7 +57,7 @@ class PredictiveSACAgent(ControllerAgent):
     off_policy_trace: float = 0.5
     """ω, in [0, 1]: at an action that the current policy would not choose, the trace is ωλ. With 1, it is always λ."""
     trace_per_dimension: bool = False
-    """Use the geometric mean, over action dimensions, of the ratio in the traces. With many, they are then longer."""
+    """Use the geometric mean of the ratio over the action dimensions. With many dimensions, traces are longer."""
     pessimism: float = 1.0
     """P, in [0, 1]. The actor and the targets use the smaller Q (1), the mean of the two (0), or a mixture."""
     train_interval_rl: int = 1

@@ -35,7 +35,7 @@ class KeptRun(Run):
 
     def __init__(self, folder: pathlib.Path, config: dict[str, Any], rows: Mapping[int, Sequence[Row]]):
         """`folder` identifies the run: the path of the file, and the name of the run's original folder."""
-        self.folder, self.shown, self.config, self._rows = folder, str(folder), config, rows
+        self.folder, self.given, self.config, self._rows = folder, folder, config, rows
 
     def rows(self, seed: int, kind: str | None = None) -> Iterator[Row]:
         return (row for row in self._rows[seed] if kind in (None, row["kind"]))

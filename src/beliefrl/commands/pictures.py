@@ -111,7 +111,7 @@ def predict(argv: Sequence[str]) -> None:
     from beliefrl.viewing.prediction import draw_predictions, predictions
 
     run = Run(options.run)
-    path = options.out or run.folder / "predictions.png"
+    path = options.out or run.given / "predictions.png"
     png, _ = figures.paths(path)  # raises an error before the episode is played
     place = path.absolute()  # an environment may change the working directory
     names = ("seed", "model", "start", "horizon", "samples", "episode_seed", "sampled", "best")
@@ -140,7 +140,8 @@ def film(argv: Sequence[str]) -> None:
 
     names = ("frames", "start", "seed", "episode_seed", "sampled", "best", "steps")
     given = {name: getattr(options, name) for name in names}
-    _written(films.film(options.runs, options.out, agent=own_agent(options.agent), **given))
+    out = options.out or (options.runs[0] / "film.png" if options.runs else None)
+    _written(films.film(options.runs, out, agent=own_agent(options.agent), **given))
 
 
 def demo(argv: Sequence[str]) -> None:

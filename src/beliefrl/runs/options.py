@@ -4,7 +4,7 @@ import dataclasses
 from typing import Literal, get_args
 
 from beliefrl.runs import trackers
-from beliefrl.types import LARGEST, UserError, check_choice, check_range
+from beliefrl.types import LARGEST, LAST_SEED, UserError, check_choice, check_range
 
 MOST_EPISODES = 100_000  # they run in parallel
 MOST_SECONDS = 1_000_000
@@ -78,7 +78,7 @@ class Options:
         check_range(self, ("checkpoint_steps", "checkpoint_minutes"), 0)
         check_range(self, ("keep_checkpoints",), 1, 1_000_000)
         check_range(self, ("seeds", "envs"), 1, 10_000)
-        check_range(self, ("seed",), 0, 2_000_000_000)
+        check_range(self, ("seed",), 0, LAST_SEED)
         check_choice(self, "processes", get_args(Processes))
         check_choice(self, "precision", get_args(Precision))
         check_choice(self, "init_best", (True, False))

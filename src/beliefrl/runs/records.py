@@ -121,7 +121,7 @@ def last_rows(log: pathlib.Path) -> list[Row]:
     return [row for row in rows if row is not None]
 
 
-def damage(log: pathlib.Path, shown: str) -> str | None:
+def damage(log: pathlib.Path, shown: pathlib.Path) -> str | None:
     """A sentence about the damaged lines of a log, which it calls `shown`; None if there are none.
 
     Raises:

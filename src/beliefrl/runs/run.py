@@ -2,12 +2,10 @@
 
     config.json           agent, task, options, versions, git commit, command line
     lock                  the process that trains; it has locked this file (`folder`)
-    metrics/seed-0.jsonl  one line for each entry: {"step", "kind", ...}; kinds: pretrain, update, episode, evaluation,
-                          diverged
-    tensorboard/seed-0/, wandb/   the same entries for trackers (`trackers`)
+    metrics/seed-0.jsonl  a line for each entry, of the kind pretrain, update, episode, evaluation or diverged
+    tensorboard/, wandb/  the same entries for trackers (`trackers`)
     checkpoints/          everything that a training needs to continue (`checkpoint`)
-    agent.safetensors     the agents of all seeds (leading axis) at the last evaluation, or at the step at which an
-                          environment failed; plain arrays, no code
+    agent.safetensors     the agents of all seeds (leading axis) at the last evaluation, or where an environment failed
     best.safetensors      the same at the evaluation with the highest return of each seed
     initial.safetensors   the networks of all seeds before the first step, if they come from another run
     initial-replay.safetensors   the replays before the first step, if they come from another run
@@ -53,22 +51,27 @@ class Run:
         """
         if not isinstance(folder, str | os.PathLike):
             raise UserError(f"{folder!r} is not a run: give a run, or the path of its folder.")
-        self.shown = str(pathlib.Path(folder))  # as it was given, for messages
-        self.folder = pathlib.Path(folder).absolute()  # an environment may change the working directory
+        self.given = pathlib.Path(folder)  # for messages
+        self.folder = self.given.absolute()  # an environment may change the working directory
         if not os.path.isdir(self.folder):  # noqa: PTH112 - pathlib's version raises if a name is too long
             raise UserError(f"There is no run folder {self.shown}: give the --out of a training.")
-        path = self.folder / "config.json"
+        path, named = self.folder / "config.json", self.given / "config.json"
         if not os.path.exists(path):  # noqa: PTH110
             raise UserError(f"{self.shown} is not a run: it has no config.json; give the --out of a training.")
         self.config: dict[str, Any] = records.parsed(path)
         if self.config is None:
-            raise UserError(f"{path} cannot be read as JSON: restore it, or train again.")
+            raise UserError(f"{named} cannot be read as JSON: restore it, or train again.")
         if not records.is_complete(self.config):
-            raise UserError(f"{path} lacks entries that every training writes: restore it, or train again.")
+            raise UserError(f"{named} lacks entries that every training writes: restore it, or train again.")
         try:
             _ = self.options
         except UserError as error:
-            raise UserError(f"{path} cannot be used: {error}") from None
+            raise UserError(f"{named} cannot be used: {error}") from None
+
+    @property
+    def shown(self) -> str:
+        """The folder as it was given, for messages."""
+        return str(self.given)
 
     @property
     def options(self) -> Options:
@@ -99,11 +102,12 @@ class Run:
 
     def damage(self) -> list[str]:
         """One sentence for each log with damaged lines, and one if logs are missing."""
-        found = [records.damage(self._metrics(seed), f"{self.shown}/metrics/seed-{seed}.jsonl") for seed in self.seeds]
+        logs = map(self._metrics, self.seeds)
+        found = [records.damage(log, self.given / "metrics" / log.name) for log in logs]
         missing = [seed for seed in self.seeds if not self._metrics(seed).exists()]
         if missing:
-            logs = f"the log of seed {missing[0]}" if len(missing) == 1 else f"the logs of {len(missing)} seeds"
-            found.append(f"{self.shown}/metrics lacks {logs}: a seed without a log counts as not started.")
+            which = f"the log of seed {missing[0]}" if len(missing) == 1 else f"the logs of {len(missing)} seeds"
+            found.append(f"{self.given / 'metrics'} lacks {which}: a seed without a log counts as not started.")
         return [sentence for sentence in found if sentence is not None]
 
     def last_rows(self, seed: int) -> list[Row]:
@@ -132,7 +136,7 @@ class Run:
             return None
         results = records.parsed(path)
         if not records.is_summary(results, len(self.seeds)):
-            raise UserError(f"{path} is damaged: restore it from a copy, or remove it.")
+            raise UserError(f"{self.given / path.name} is damaged: restore it from a copy, or remove it.")
         return results
 
     def reached(self, line: float | None, patience: int) -> bool:
@@ -259,19 +263,15 @@ class Recorder(Run):
 
     def flush(self) -> None:
         """Flush the trackers."""
-        for of_seed in self._trackers.values():
-            for tracker in of_seed:
-                tracker.flush()
+        for tracker in (each for of_seed in self._trackers.values() for each in of_seed):
+            tracker.flush()
 
     def save(self, agents: Any, but: Collection[int] = (), step: int | None = None) -> None:
-        """Save the agents of all seeds at a step atomically; those of the seeds `but` (indices) are not changed.
-
-        A damaged file is moved to damaged-agent.safetensors.
-        """
+        """Save the agents of all seeds at a step atomically; those of the seeds `but` (indices) are not changed."""
         path, saved = self.folder / "agent.safetensors", arrays.copied(agents)
         try:
             before = arrays.load(path) if but and path.exists() else {}
-        except arrays.Damaged:
+        except arrays.Damaged:  # moved aside
             path.replace(self.folder / f"damaged-{path.name}")
             before = {}
         for name, kept in before.items():

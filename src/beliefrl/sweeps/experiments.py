@@ -5,9 +5,10 @@ import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from beliefrl.types import UserError, check_whole, plain, short
+import numpy as np
 
-MOST = 2_000_000_000  # the highest seed number, as in `Options`
+from beliefrl.types import LAST_SEED, UserError, check_whole, plain, short
+
 NAMED = Mapping, "a dictionary from names to values"
 KINDS = (
     ("agent", str, "its name"),
@@ -22,7 +23,7 @@ KINDS = (
 class Experiment:
     """An agent with its settings on a task, and the seeds to train: one line of a figure.
 
-    Values are kept as JSON has them, so NumPy's numbers may be given.
+    Settings, constants and seeds are kept as JSON has them, so they may be NumPy's numbers.
     """
 
     agent: str
@@ -47,6 +48,8 @@ class Experiment:
                 raise UserError(f"{name}={short(value)} is impossible: give {what}.")
         object.__setattr__(self, "seeds", _numbers(self.seeds))
         for name in ("settings", "constants"):
+            if not all(isinstance(key, str) for key in getattr(self, name)):
+                raise UserError(f"{name}={short(getattr(self, name))} is impossible: its names must be texts.")
             object.__setattr__(self, name, plain(dict(getattr(self, name))))
 
 
@@ -59,7 +62,7 @@ def _numbers(seeds: Any) -> tuple[int, ...]:
     if not numbers:
         raise UserError("seeds has no seed number: give one or more, such as (0, 1, 2).")
     for number in numbers:
-        check_whole("seed", number, 0, MOST)
+        check_whole("seed", number, 0, LAST_SEED)
     return tuple(map(int, numbers))
 
 
@@ -81,7 +84,7 @@ def grid(
         fixed: settings with one value.
 
     Raises:
-        UserError: the values of a setting are not a list.
+        UserError: the values of a setting are not a list, or the seeds are impossible.
     """
     agents, tasks = ([names] if isinstance(names, str) else names for names in (agents, tasks))
     if not isinstance(settings, Mapping | None):
@@ -90,9 +93,9 @@ def grid(
         if isinstance(value, str) or not isinstance(value, Iterable):
             raise UserError(f"{name}={value} is not a list of values: give [{value!r}], or {name}= as an argument.")
     names, values = list(settings or {}), list((settings or {}).values())
-    if not isinstance(seeds, Iterable):
+    if np.ndim(seeds) == 0:
         check_whole("seeds", seeds, 1)
-    numbers = seeds if isinstance(seeds, Iterable) else range(seeds)
+    numbers = _numbers(seeds if np.ndim(seeds) else range(int(seeds)))  # pyright: ignore[reportArgumentType]
     return [
         Experiment(agent, task, {**fixed, **dict(zip(names, combination, strict=True))}, numbers)
         for task in tasks

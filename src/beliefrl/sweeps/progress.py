@@ -1,5 +1,6 @@
 """The state and the progress of a sweep (from the ends of its logs), the time left, and the display of these."""
 
+import copy
 import dataclasses
 import pathlib
 import statistics
@@ -41,16 +42,17 @@ class SweepStatus:
     def count(self) -> int:
         return len(self.finished) + len(self.waiting) + len(self.running) + len(self.failed) + len(self.pruned)
 
-    def take(self, folder: pathlib.Path) -> Training | None:
-        """Take the first waiting training whose run in `folder` no other process trains; None if there is none.
 
-        Trainings of a sweep that was killed take a while to end, after the sweep has been started again.
-        """
-        for index, training in enumerate(self.waiting):
-            if not is_locked(folder / training.name):
-                return self.waiting.pop(index)
-            self.held.add(training.name)
-        return None
+def take(status: SweepStatus, folder: pathlib.Path) -> Training | None:
+    """Take the first waiting training whose run in `folder` no other process trains; None if there is none.
+
+    Trainings of a sweep that was killed take a while to end, after the sweep has been started again.
+    """
+    for index, training in enumerate(status.waiting):
+        if not is_locked(folder / training.name):
+            return status.waiting.pop(index)
+        status.held.add(training.name)
+    return None
 
 
 class SweepProgress:
@@ -161,7 +163,7 @@ class SweepDisplay:
             together = f", {len(status.running)} at a time" if status.running else ""
             self.screen.line(f"{status.count} trainings{already}{together}")
             self.before = SweepStatus([*status.finished], [], pruned=[*status.pruned])
-        for name in status.held - self.before.held:
+        for name in sorted(status.held - self.before.held):
             self.screen.line(f"waits: {name}, which another process still trains")
         for name in status.running:
             if name not in self.before.running:
@@ -173,14 +175,7 @@ class SweepDisplay:
         for name, why in status.failed.items():
             if name not in self.before.failed:
                 self.screen.line(f"failed: {name}: {why}")
-        self.before = SweepStatus(
-            [*status.finished],
-            [*status.waiting],
-            dict(status.running),
-            dict(status.failed),
-            [*status.pruned],
-            held=set(status.held),
-        )
+        self.before = copy.deepcopy(status)
 
     def _summary(self, status: SweepStatus) -> str:
         failed = f", {len(status.failed)} failed" if status.failed else ""

@@ -21,7 +21,7 @@ from beliefrl.sweeps import places, sources
 from beliefrl.sweeps import plan as plans
 from beliefrl.sweeps.experiments import Experiment
 from beliefrl.sweeps.plan import Training
-from beliefrl.sweeps.progress import SweepDisplay, SweepStatus
+from beliefrl.sweeps.progress import SweepDisplay, SweepStatus, take
 from beliefrl.training.checks import CHANGEABLE
 from beliefrl.training.stop import Requests, Stopped
 from beliefrl.types import UserError, cause, check_whole, one_line, plain, short
@@ -105,7 +105,7 @@ def sweep(
 
 
 class _OfReport(Exception):
-    """An OSError that `report` has raised. `writing` takes an OSError for one of the folder."""
+    """An OSError that `report` has raised, so that `writing` does not take it for one of the folder."""
 
 
 @contextlib.contextmanager
@@ -181,7 +181,7 @@ def _status(folder: pathlib.Path, trainings: Sequence[Training]) -> SweepStatus:
 
 def _loop(folder: pathlib.Path, status: SweepStatus, launcher: Launcher, report: Report, requests: Requests) -> None:
     while True:
-        while launcher.room > 0 and (training := status.take(folder)):
+        while launcher.room > 0 and (training := take(status, folder)):
             launcher.start(training)
             status.running[training.name] = training
         for name, code in launcher.ended().items():

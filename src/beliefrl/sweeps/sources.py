@@ -126,9 +126,10 @@ def load(path: str | os.PathLike[str]) -> list[Experiment]:
     sys.modules[spec.name] = module  # dataclasses look for their module there
     try:
         spec.loader.exec_module(module)
-    except UserError:
-        raise
     except (Exception, SystemExit) as error:  # a user's file may raise anything
+        del sys.modules[spec.name]
+        if isinstance(error, UserError):
+            raise
         raise UserError(f"{path} cannot be run: {said(error)}.") from None
     found = getattr(module, "experiments", None)
     if not isinstance(found, list | tuple) or not all(isinstance(each, Experiment) for each in found):

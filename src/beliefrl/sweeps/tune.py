@@ -25,7 +25,7 @@ from beliefrl.runs.options import Options
 from beliefrl.sweeps import places, ranges, study
 from beliefrl.sweeps.experiments import Experiment
 from beliefrl.sweeps.plan import Training
-from beliefrl.sweeps.progress import SweepStatus
+from beliefrl.sweeps.progress import SweepStatus, take
 from beliefrl.sweeps.run import confirm, lock, reason, reporting, writing
 from beliefrl.sweeps.study import Actions, Objective, Search, Trial
 from beliefrl.training.stop import Requests, Stopped
@@ -218,7 +218,7 @@ class _Loop:
 
     def step(self) -> None:
         """Start what there is room for, and look after the running trials."""
-        while self.launcher.room > 0 and (waiting := self.status.take(self.folder)):
+        while self.launcher.room > 0 and (waiting := take(self.status, self.folder)):
             self._begin(waiting.name)
         self.collect()
         for name in self.status.running:

@@ -193,4 +193,4 @@ def _naming(run: Run) -> Iterator[None]:
     except UserError as error:
         commit = one_line(str(run.config.get("git_commit") or ""))[:12]
         origin = f" (trained at commit {commit})" if commit else ""
-        raise UserError(f"{run.folder / 'config.json'}{origin} cannot be used: {error}") from None
+        raise UserError(f"{run.given / 'config.json'}{origin} cannot be used: {error}") from None

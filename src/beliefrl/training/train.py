@@ -168,7 +168,7 @@ def _go_on(
     _ = Options(**_options(run) | changes)  # raise before the folder is locked
     with contextlib.ExitStack() as showing, contextlib.ExitStack() as stack:
         recorder = stack.enter_context(Recorder(folder, None))
-        recorder.shown = shown
+        recorder.given = run.given
         made = task_of(recorder, task)
         if task is not None:
             checks.same_task(recorder, made)

@@ -53,17 +53,17 @@ def _mp4(path: pathlib.Path, fps: float) -> Iterator[Writer]:
             ffmpeg = subprocess.Popen(command, stdin=pipe, stderr=pipe, start_new_session=True)
         ffmpeg.stdin.write(pixels.tobytes())
 
-    broken = None
+    broken = False
     try:
         try:
             yield add
-        except BrokenPipeError as error:  # ffmpeg has ended, and says why
+        except BrokenPipeError:  # ffmpeg has ended, and says why
             if ffmpeg is None:
                 raise
-            broken = error
+            broken = True
         message = ffmpeg.communicate()[1].decode(errors="replace").strip()
         if ffmpeg.returncode or broken:
-            raise OSError(message or broken)
+            raise OSError(message or f"ffmpeg ended with code {ffmpeg.returncode}")
     finally:
         if ffmpeg is not None and ffmpeg.poll() is None:
             ffmpeg.kill()
