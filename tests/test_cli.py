@@ -132,6 +132,22 @@ def test_too_little_memory_is_said_in_one_sentence(folders, capsys, monkeypatch,
     assert "not enough memory" in complaint(capsys, [*TRAIN.split(), "--out", "run"])
 
 
+def test_a_mistake_has_its_exit_code_without_anybody_who_reads_it(tmp_path, monkeypatch):
+    class Closed:
+        def write(self, text):
+            raise BrokenPipeError
+
+    monkeypatch.setattr(sys, "stderr", Closed())
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["show", str(tmp_path / "nowhere")])
+    assert ended.value.code == 2
+
+
+def test_a_program_without_an_output_ends_as_usual(monkeypatch):
+    monkeypatch.setattr(sys, "stdout", None)
+    cli.main(["--version"])
+
+
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 @pytest.mark.parametrize("line", ["agents", "--version", "train vrm --help"])
 def test_a_reader_that_closes_the_pipe_is_no_error(line, unbuffered):

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -74,7 +75,7 @@ def test_seeds_are_whole_numbers(seeds, phrase, unchecked):
         Experiment("vrm", "pendulum", seeds=seeds)
 
 
-@pytest.mark.parametrize("seeds", [0, -1, None, 1.5, True])
+@pytest.mark.parametrize("seeds", [0, -1, None, 1.5, True, iter([0, 1]), "3"])
 def test_a_grid_has_one_seed_or_more(seeds, unchecked):
     with pytest.raises(UserError, match=r"seeds=.* is impossible: it must be a whole number of at least 1"):
         grid(["vrm"], ["pendulum"], seeds=seeds)
@@ -299,6 +300,19 @@ def test_a_file_may_define_a_dataclass_whose_types_are_text(tmp_path):
     lines += ("    count: int = 3", "experiments = []")
     (tmp_path / "mine.py").write_text("\n".join(lines))
     assert load(tmp_path / "mine.py") == []
+
+
+@pytest.mark.parametrize("line", ["1 / 0", "raise SystemExit", "import beliefrl; beliefrl.Faults(noise=-1.0)"])
+def test_a_file_that_fails_is_not_kept_as_a_module(tmp_path, line):
+    (tmp_path / "mine.py").write_text(line)
+    with pytest.raises(UserError):
+        load(tmp_path / "mine.py")
+    assert "beliefrl_sweep" not in sys.modules
+
+
+def test_names_of_settings_are_texts(unchecked):
+    with pytest.raises(UserError, match=r"settings=.* is impossible: its names must be texts"):
+        Experiment("vrm", "pendulum", {3: 0.9})
 
 
 def test_a_file_makes_experiments(tmp_path):

@@ -119,9 +119,13 @@ def test_a_line_below_the_picture_leaves_it_as_it_is_and_its_sides_even():
     assert image[22:].min() < 100 < 200 < image[22:].max()  # ink on paper
 
 
-def test_an_mp4_that_cannot_be_encoded_says_what_ffmpeg_said(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("line", "why"),
+    [("echo 'Unknown encoder libx264' >&2", "Unknown encoder libx264"), ("", "ffmpeg ended with code 1")],
+)
+def test_an_mp4_that_cannot_be_encoded_says_what_ffmpeg_said(tmp_path, monkeypatch, line, why):
     program = tmp_path / "ffmpeg"
-    program.write_text("#!/bin/sh\nexec 0<&-\necho 'Unknown encoder libx264' >&2\nexit 1\n")
+    program.write_text(f"#!/bin/sh\nexec 0<&-\n{line}\nexit 1\n")
     program.chmod(0o700)
     package = types.SimpleNamespace(get_ffmpeg_exe=lambda: str(program))
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", package)
@@ -131,7 +135,7 @@ def test_an_mp4_that_cannot_be_encoded_says_what_ffmpeg_said(tmp_path, monkeypat
             for _ in range(1000):
                 add(np.zeros((100, 100, 3), np.uint8))
 
-    with pytest.raises(UserError, match=r"cannot be written \(Unknown encoder libx264\): choose another file"):
+    with pytest.raises(UserError, match=rf"cannot be written \({why}\): choose another file"):
         write()
     assert [path.name for path in tmp_path.iterdir()] == ["ffmpeg"]
 
