@@ -93,9 +93,10 @@ def grid(
         if isinstance(value, str) or not isinstance(value, Iterable):
             raise UserError(f"{name}={value} is not a list of values: give [{value!r}], or {name}= as an argument.")
     names, values = list(settings or {}), list((settings or {}).values())
-    if np.ndim(seeds) == 0:
-        check_whole("seeds", seeds, 1)
-    numbers = _numbers(seeds if np.ndim(seeds) else range(int(seeds)))  # pyright: ignore[reportArgumentType]
+    numbers: Any = seeds
+    if np.ndim(numbers) == 0:
+        check_whole("seeds", numbers, 1)
+        numbers = range(int(numbers))
     return [
         Experiment(agent, task, {**fixed, **dict(zip(names, combination, strict=True))}, numbers)
         for task in tasks
