@@ -18,6 +18,10 @@ class Fault(UserError):
     stretch: Any = None
 
 
+class OfCallback(Exception):
+    """Wraps an OSError that a function of the user raised, since other OSErrors are taken for those of the folder."""
+
+
 def cause(error: OSError) -> str:
     """The operating system's reason for an error, or else the error's own text."""
     return error.strerror or one_line(str(error))

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 from beliefrl import agents
+from beliefrl.errors import OfCallback
 from beliefrl.runs.folder import locked
 from beliefrl.runs.given_files import as_path
 from beliefrl.runs.options import Options
@@ -104,16 +105,12 @@ def sweep(
     return status
 
 
-class _OfReport(Exception):
-    """An OSError that `report` has raised, so that `writing` does not take it for one of the folder."""
-
-
 @contextlib.contextmanager
 def writing(folder: pathlib.Path) -> Iterator[None]:
     """Raise a UserError in place of an OSError, such as that of a full disk; not in place of one of `report`."""
     try:
         yield
-    except _OfReport as error:
+    except OfCallback as error:
         raise error.__cause__ or error from None
     except ConnectionError:  # also BrokenPipeError: the reader of the output has closed it
         raise
@@ -145,7 +142,7 @@ def _call(report: Report, status: SweepStatus) -> None:
     try:
         report(status)
     except OSError as error:
-        raise _OfReport from error
+        raise OfCallback from error
 
 
 def _check_named(folder: pathlib.Path, before: Sequence[Training], experiments: Sequence[Experiment]) -> None:

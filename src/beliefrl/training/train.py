@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from beliefrl import agents, tasks
 from beliefrl.agents import Agent, hyperparameters
+from beliefrl.errors import OfCallback
 from beliefrl.runs.checkpoint import listed, was_ever_written
 from beliefrl.runs.folder import free_folder, locked, write_config
 from beliefrl.runs.records import provenance
@@ -225,10 +226,6 @@ def _put_back(folder: pathlib.Path, config: dict[str, Any]) -> None:
         write_config(folder, config)
 
 
-class _OfCallback(Exception):
-    """An OSError that `report` or `callback` has raised. `Session` takes an OSError for one of the run's folder."""
-
-
 @contextlib.contextmanager
 def _reporting(run: Run, report: Callback | None, callback: Callback | None, progress: bool) -> Iterator[Callback]:
     """A function that calls the display (unless `progress` is False), `report` and `callback` with an Event.
@@ -251,11 +248,11 @@ def _reporting(run: Run, report: Callback | None, callback: Callback | None, pro
                     report(event)
                 return None if callback is None else callback(event)
             except OSError as error:
-                raise _OfCallback from error
+                raise OfCallback from error
 
         try:
             yield listen
-        except _OfCallback as error:
+        except OfCallback as error:
             raise error.__cause__ or error from None
 
 
