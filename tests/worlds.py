@@ -11,7 +11,8 @@ import numpy as np
 from gymnasium import spaces
 
 from beliefrl import agents, tasks
-from beliefrl.runs.run import Recorder, Run
+from beliefrl.runs.recorder import Recorder
+from beliefrl.runs.run import Run
 from beliefrl.types import Spec, WindowShape, transitions
 
 TINY = {

@@ -13,7 +13,7 @@ import pytest
 from beliefrl import Options, UserError, resume
 from beliefrl.runs import arrays, best, trackers
 from beliefrl.runs.folder import is_locked, locked, make
-from beliefrl.runs.run import Recorder
+from beliefrl.runs.recorder import Recorder
 from inputs import a_run, flat
 
 CONFIG = {
@@ -262,7 +262,7 @@ def connect(self, address):
     assert local, f"The network was used: {address}"
     return real(self, address)
 socket.socket.connect = connect
-from beliefrl.runs.run import Recorder
+from beliefrl.runs.recorder import Recorder
 config = {"agent": "vrm", "hyperparameters": {}, "task": "pendulum", "constants": {}, "started": "2026-01-01T00:00:00"}
 run = Recorder(sys.argv[1], {**config, "options": {"seed": 0, "seeds": 2, "track": ["wandb"]}})
 for seed in (0, 1):

@@ -18,8 +18,9 @@ from beliefrl.runs import best, records
 from beliefrl.runs.arrays import write_whole
 from beliefrl.runs.folder import folder_name, free_folder
 from beliefrl.runs.options import Options
+from beliefrl.runs.recorder import Recorder
 from beliefrl.runs.records import provenance
-from beliefrl.runs.run import Recorder, Run
+from beliefrl.runs.run import Run
 from beliefrl.training import log
 from beliefrl.training.restore import as_argument
 from beliefrl.training.rollout import Episode

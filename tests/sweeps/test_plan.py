@@ -10,7 +10,7 @@ import pytest
 
 from beliefrl import agents, cli, tasks
 from beliefrl.runs.options import Options
-from beliefrl.runs.run import Recorder
+from beliefrl.runs.recorder import Recorder
 from beliefrl.sweeps import sources
 from beliefrl.sweeps.experiments import Experiment, grid
 from beliefrl.sweeps.plan import extended, plan, shrunk

@@ -103,13 +103,12 @@ def test_one_with_a_function_is_resumed_and_its_numbers_are_compared(tmp_path):
         beliefrl.train(dataclasses.replace(again, scale=2.0), "pendulum-p", folder, resume=True, **OPTIONS)
 
 
-@pytest.mark.parametrize("name", ["report", "callback"])
-def test_an_oserror_of_a_callback_is_not_one_of_the_run(tmp_path, name):
+def test_an_oserror_of_a_callback_is_not_one_of_the_run(tmp_path):
     def fails(event):
         raise FileNotFoundError("mine.txt")
 
     with pytest.raises(FileNotFoundError, match=r"^mine\.txt$"):
-        beliefrl.train(Foreteller(), "pendulum-p", tmp_path / "run", **{name: fails}, **OPTIONS)
+        beliefrl.train(Foreteller(), "pendulum-p", tmp_path / "run", callback=fails, **OPTIONS)
 
 
 def test_a_diverged_seed_is_null_in_json(run, monkeypatch, capsys):

@@ -20,7 +20,8 @@ from beliefrl.runs.arrays import load as load_arrays
 from beliefrl.runs.arrays import packed
 from beliefrl.runs.best import evaluations
 from beliefrl.runs.checkpoint import Checkpoints, _sha256, _signed, listed
-from beliefrl.runs.run import Recorder, Run
+from beliefrl.runs.recorder import Recorder
+from beliefrl.runs.run import Run
 from beliefrl.tasks import make
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import session
@@ -40,7 +41,7 @@ class Crash(Exception):
 
 
 def crash_at(number):
-    """A report that crashes at the event of that number."""
+    """A callback that crashes at the event of that number."""
     seen = []
 
     def report(event):
@@ -436,7 +437,7 @@ def test_a_callback_stops_a_training_that_goes_on_to_the_last_bit(whole, tmp_pat
         f"beliefrl.resume({str(run.folder)!r})"
     ]
     assert not is_finished(run)
-    resume(run, callback=lambda event: "only True stops it", report=lambda event: True)
+    resume(run, callback=lambda event: "only True stops it")
     assert files(run.folder) == files(whole[0])
 
 
@@ -446,6 +447,58 @@ def test_a_training_ends_at_the_evaluation_that_reaches_the_line(tmp_path, line,
     options = {"steps": 30, "eval_every": 10, "eval_episodes": 1, "stop_at": line, "stop_patience": patience}
     run = train(CountingAgent(step_start_rl=30), Counting(), tmp_path / "run", **options)
     assert run.results()["step"] == end
+
+
+COUNTED = {"steps": 30, "eval_every": 10, "eval_episodes": 1, "progress": False}  # every return is 28
+
+
+def without_checkpoints(run):
+    shutil.rmtree(run.folder / "checkpoints")
+    return Run(run.folder)
+
+
+def test_a_training_that_reached_its_line_but_wrote_nothing_begins_again(tmp_path):
+    """It was killed between its last evaluation and its first checkpoint."""
+    agent, task = CountingAgent(step_start_rl=30), Counting()
+    run = without_checkpoints(train(agent, task, tmp_path / "run", stop_at=28.0, **COUNTED))
+    with pytest.raises(UserError, match="has no usable checkpoint left"):
+        resume(run, task=task, agent=agent, progress=False)
+    (run.folder / "results.json").unlink()
+    assert resume(run, task=task, agent=agent, progress=False).results()["step"] == 10
+
+
+def test_a_training_that_begins_again_has_no_results_of_before(tmp_path):
+    agent, task = CountingAgent(step_start_rl=30), Counting()
+    first = train(agent, task, tmp_path / "run", lambda event: event.evaluation is not None, **COUNTED)
+    assert first.results()["step"] == 10
+
+    def end(event):
+        if event.phase is Phase.EXPLORING:
+            signal.raise_signal(signal.SIGTERM)
+
+    with pytest.raises(Stopped):
+        resume(without_checkpoints(first), None, task, end, agent, progress=False)
+    assert first.results() is None
+    assert (first.folder / "before-1" / "results.json").exists()
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_resume_on_a_full_disk_is_one_sentence_and_changes_nothing(tmp_path, monkeypatch, lost):
+    agent, task = CountingAgent(step_start_rl=30), Counting()
+    run = train(agent, task, tmp_path / "run", lambda event: event.evaluation is not None, **COUNTED)
+    if lost:
+        run = without_checkpoints(run)
+    before = (run.folder / "config.json").read_bytes()
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("beliefrl.runs.recorder.write_config", full)
+    with pytest.raises(
+        UserError, match=r"cannot be written \(No space left on device\): fix that, then `beliefrl resume"
+    ):
+        resume(run, 40, task, agent=agent, progress=False)
+    assert (run.folder / "config.json").read_bytes() == before
 
 
 @pytest.mark.parametrize(
@@ -643,7 +696,7 @@ def test_a_training_whose_checkpoints_are_gone_begins_again_and_keeps_what_it_ha
 
 
 def crash_after_evaluation():
-    """A report that crashes after the first evaluation."""
+    """A callback that crashes after the first evaluation."""
 
     def report(event):
         if event.evaluation is not None:

@@ -230,11 +230,11 @@ def test_a_notebook_shows_the_sentence():
 # A full disk: one sentence that says how to go on, whichever file has no room, and nothing stays held.
 
 FILES = {  # where a file begins to have no room: which function of which class is called then
-    "metrics": "beliefrl.runs.run.Recorder.log",
+    "metrics": "beliefrl.runs.recorder.Recorder.log",
     "tensorboard": "beliefrl.runs.trackers.TensorBoard.flush",
     "checkpoint": "beliefrl.runs.checkpoint.Checkpoints.save",
-    "agent": "beliefrl.runs.run.Recorder.save",
-    "results": "beliefrl.runs.run.Recorder.finish",
+    "agent": "beliefrl.runs.recorder.Recorder.save",
+    "results": "beliefrl.runs.recorder.Recorder.finish",
 }
 LIMITED = """
 import importlib, resource, signal, sys
@@ -248,7 +248,7 @@ def limited(*given, **named):
 setattr(kind, name, limited)
 from beliefrl import train
 from beliefrl import UserError, agents
-from beliefrl.runs.run import Recorder
+from beliefrl.runs.recorder import Recorder
 small = dict(step_start_rl=20, pretrain_updates=5, batch_size=8, policy_layers=(8,), value_layers=(8,))
 agent = agents.make("sac-mlp", **small)
 try:

@@ -104,3 +104,6 @@ class Options:
         for name in self.track:
             if name not in tuple(trackers.TRACKERS):
                 raise UserError(f"track={name} is impossible: it must be {' or '.join(trackers.TRACKERS)}.")
+
+
+NAMES = tuple(field.name for field in dataclasses.fields(Options))

@@ -18,26 +18,17 @@ Lines are flushed one by one, so a killed training loses at most the line that i
 content of files is checked when it is read (`records`), so callers need not check it again.
 """
 
-import contextlib
-import dataclasses
-import json
 import os
 import pathlib
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from statistics import fmean
 from typing import Any
 
-import numpy as np
-
-from beliefrl.runs import arrays, records, trackers
-from beliefrl.runs.arrays import write_whole
+from beliefrl.runs import arrays, records
 from beliefrl.runs.best import BEST
-from beliefrl.runs.folder import locked, make, write_config
-from beliefrl.runs.given_files import as_path
-from beliefrl.runs.options import Options
-from beliefrl.runs.records import Row, now
-from beliefrl.runs.trackers import Tracker
-from beliefrl.types import UserError, cause, one_line, tuples
+from beliefrl.runs.options import NAMES, Options
+from beliefrl.runs.records import Row
+from beliefrl.types import UserError, one_line, tuples
 
 
 class Run:
@@ -76,9 +67,8 @@ class Run:
     @property
     def options(self) -> Options:
         """The options of the training. Options that only other versions have are left out."""
-        known = {field.name for field in dataclasses.fields(Options)}
         given = tuples(self.config["options"])
-        return Options(**{name: value for name, value in given.items() if name in known})
+        return Options(**{name: value for name, value in given.items() if name in NAMES})
 
     def __repr__(self) -> str:
         """The folder, the agent and the task: `<Run runs/first: vrm on pendulum-v>`."""
@@ -153,6 +143,19 @@ class Run:
         returns = [[fmean(row["sampled"]) for row in self.rows(seed, "evaluation")][-patience:] for seed in going]
         return bool(going) and all(len(last) == patience and min(last) >= line for last in returns)
 
+    def is_complete(self, options: Options) -> bool:
+        """Whether the training ended at the last step of `options`, or reached their `stop_at`, and wrote its results.
+
+        A log alone is not enough: the run may have been killed before it wrote its checkpoint.
+
+        Raises:
+            UserError: results.json is damaged, or a log cannot be read.
+        """
+        results = self.results()
+        if results is None:
+            return False
+        return (results.get("step") or 0) >= options.steps or self.reached(options.stop_at, options.stop_patience)
+
     def load(self, like: Any, best: bool = False) -> Any:
         """The agents of the last evaluation, or the best ones, in a tree of the structure, shapes and types of `like`.
 
@@ -174,127 +177,3 @@ class Run:
             raise UserError(f"{self.shown} has only its last agent: leave out --best, in Python best=.")
         which = "best" if best else "trained"
         raise UserError(f"{self.shown} has no {which} agent yet: it is saved at the first evaluation.")
-
-
-class Recorder(Run):
-    """A run's folder, for writing. Only this process can write it."""
-
-    def __init__(self, folder: str | os.PathLike[str], config: dict[str, Any] | None):
-        """Make the folder. Without a config, open an existing one.
-
-        Raises:
-            UserError: the folder exists already or cannot be made (with a config), does not exist (without), or is
-                written by another process; or a tracker cannot be opened.
-        """
-        if config is not None:
-            make(as_path(folder), config)
-        super().__init__(folder)
-        self._lock = locked(self.folder, "is being trained")
-        self._lines: dict[int, Any] = {}
-        self._trackers: dict[int, list[Tracker]] = {}
-        if config is not None:
-            with contextlib.ExitStack() as stack:
-                stack.push(self)
-                self._open()
-                stack.pop_all()
-
-    def __enter__(self) -> "Recorder":
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        try:
-            self.close()
-        except Exception:
-            if kind is None:  # otherwise the first error is reported
-                raise
-
-    def _open(self) -> None:
-        track = self.config["options"].get("track", ("tensorboard",))
-        for seed in self.seeds:
-            path = self._metrics(seed)
-            try:
-                self._lines[seed] = path.open("a", buffering=1)
-            except OSError as error:
-                raise UserError(f"{path} cannot be written ({cause(error)}): fix the cause, then try again.") from None
-            self._trackers[seed] = trackers.open_all(track, self.folder, seed, self.config)
-
-    def note_end(self) -> None:
-        """Record the time at which this session ends. A full disk is ignored."""
-        records.sessions(self.config)[-1]["ended"] = now()
-        with contextlib.suppress(OSError):
-            write_config(self.folder, self.config)
-
-    def amend(self, changes: dict[str, Any], session: dict[str, Any]) -> None:
-        """Change the config, and append a session to its `resumed`."""
-        self.config |= changes
-        self.config["resumed"] = [*self.config.get("resumed", ()), session]
-        write_config(self.folder, self.config)
-
-    def lengths(self) -> dict[int, int]:
-        """Flush the log of each seed to the disk; returns the sizes of the logs in bytes."""
-        for lines in self._lines.values():
-            lines.flush()
-            os.fsync(lines.fileno())
-        return {seed: self._metrics(seed).stat().st_size for seed in self.seeds}
-
-    def rewind(self, lengths: dict[int, int]) -> None:
-        """Truncate the log of each seed to its length in bytes. New entries are appended there.
-
-        Raises:
-            UserError: a log is shorter than that.
-        """
-        for seed, length in lengths.items():
-            path = self._metrics(seed)
-            size = path.stat().st_size if path.exists() else 0
-            if size < length:
-                raise UserError(f"{path} is shorter than when the checkpoint was written: restore it from a copy.")
-            if size > length:
-                os.truncate(path, length)
-        self._open()
-        for seed in self.seeds:
-            whole = [tracker for tracker in self._trackers[seed] if tracker.is_whole]
-            for row in self.rows(seed) if whole else ():
-                _track(whole, row["kind"], row["step"], row)
-
-    def log(self, seed: int, kind: str, step: int, values: Row) -> None:
-        """Write one entry of a seed. Its trackers receive the numbers, and the means of lists."""
-        self._lines[seed].write(json.dumps({"step": step, "kind": kind, **values}) + "\n")
-        _track(self._trackers[seed], kind, step, values)
-
-    def flush(self) -> None:
-        """Flush the trackers."""
-        for tracker in (each for of_seed in self._trackers.values() for each in of_seed):
-            tracker.flush()
-
-    def save(self, agents: Any, but: Collection[int] = (), step: int | None = None) -> None:
-        """Save the agents of all seeds at a step atomically; those of the seeds `but` (indices) are not changed."""
-        path, saved = self.folder / "agent.safetensors", arrays.copied(agents)
-        try:
-            before = arrays.load(path) if but and path.exists() else {}
-        except arrays.Damaged:  # moved aside
-            path.replace(self.folder / f"damaged-{path.name}")
-            before = {}
-        for name, kept in before.items():
-            saved[name][sorted(but)] = kept[sorted(but)]
-        write_whole(path, arrays.packed(saved, None if step is None else {"step": str(step)}))
-
-    def finish(self, results: Row) -> None:
-        """Write the summary of the last evaluation."""
-        write_whole(self.folder / "results.json", (json.dumps(results, indent=2) + "\n").encode())
-
-    def close(self) -> None:
-        """Close logs and trackers, and unlock the folder. All are closed, even if closing one of them fails."""
-        with contextlib.ExitStack() as stack:
-            stack.callback(self._lock.close)
-            for writer in (*self._lines.values(), *(each for of_seed in self._trackers.values() for each in of_seed)):
-                stack.callback(writer.close)
-
-
-def _track(trackers: list[Tracker], kind: str, step: int, values: Row) -> None:
-    numbers = {
-        f"{kind}/{name}": float(np.mean(value))
-        for name, value in values.items()
-        if name not in ("step", "kind") and isinstance(value, int | float | list)
-    }
-    for tracker in trackers:
-        tracker.log(step, numbers)

@@ -18,6 +18,7 @@ from typing import Any
 from beliefrl import agents, tasks
 from beliefrl.catalogue import unmasked
 from beliefrl.runs.folder import folder_name
+from beliefrl.runs.options import NAMES as OPTIONS
 from beliefrl.runs.options import Options
 from beliefrl.runs.run import Run
 from beliefrl.sweeps.experiments import Experiment
@@ -25,7 +26,6 @@ from beliefrl.tasks.faults import Faults
 from beliefrl.training.schedule import capacity
 from beliefrl.types import UserError, plain
 
-OPTIONS = tuple(field.name for field in dataclasses.fields(Options))
 FAULTS = tuple(field.name for field in dataclasses.fields(Faults))
 SHRINKS = ("step_start_rl", "train_times_fivrm", "pretrain_updates")  # hyperparameters that count steps or updates
 LONGEST_NAME = 120  # characters of a folder's name, without the seeds
@@ -69,15 +69,9 @@ class Training:
         folder = sweep / self.name
         if not (folder / "config.json").exists():
             return False
-        options = options_of(self)
         try:
             run = Run(folder)
-            results = run.results()
-            if results is not None and (results.get("step") or 0) >= self.steps:
-                return True
-            if results is not None and run.reached(options.stop_at, options.stop_patience):
-                return True
-            return all(map(run.has_diverged, run.seeds))
+            return run.is_complete(options_of(self)) or all(map(run.has_diverged, run.seeds))
         except UserError:
             return False  # it is damaged, and the training says so
 

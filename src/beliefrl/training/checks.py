@@ -6,11 +6,11 @@ from typing import Any
 
 from beliefrl import tasks
 from beliefrl.runs import trackers
+from beliefrl.runs.options import Options
 from beliefrl.runs.records import steps_per_action
 from beliefrl.runs.run import Run
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.traced import check_traced
-from beliefrl.training.schedule import Options
 from beliefrl.types import UserError, plain, short
 
 RECORDING = ("processes", "checkpoint_steps", "checkpoint_minutes", "keep_checkpoints", "track")
@@ -23,11 +23,10 @@ def patience(options: Options) -> None:
         raise UserError(f"stop_patience={options.stop_patience} needs stop_at: give the return, too.")
 
 
-def listeners(**functions: Any) -> None:
-    """Raise a UserError for an argument that is not None and cannot be called."""
-    for name, function in functions.items():
-        if function is not None and not callable(function):
-            raise UserError(f"{name}={short(function)} is impossible: give a function of an Event.")
+def callback(function: Any) -> None:
+    """Raise a UserError if a callback cannot be called."""
+    if function is not None and not callable(function):
+        raise UserError(f"callback={short(function)} is impossible: give a function of an Event.")
 
 
 def possible(options: Options, task: Any, own_process: bool) -> None:

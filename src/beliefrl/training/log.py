@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from beliefrl.runs import best
-from beliefrl.runs.run import Recorder
+from beliefrl.runs.recorder import Recorder
 from beliefrl.training.rollout import Episode
 from beliefrl.training.schedule import Event
 from beliefrl.training.summary import MODES, summary

@@ -21,7 +21,8 @@ from beliefrl.analysis.figures import draw_curve
 from beliefrl.runs.checkpoint import Checkpoints
 from beliefrl.runs.folder import set_aside
 from beliefrl.runs.options import Options
-from beliefrl.runs.run import Recorder, Run
+from beliefrl.runs.recorder import Recorder
+from beliefrl.runs.run import Run
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import initial, log
 from beliefrl.training import replay as ring
@@ -67,16 +68,20 @@ class Session:
         self,
         restore: Callable[[SeedState], Snapshot] | None = None,
         files: dict[str, dict[str, np.ndarray]] | None = None,
+        begins_again: bool = False,
     ) -> Run:
         """Train to the last step, or until something ends the training before it.
 
         Args:
             restore: `Session.restore`, to continue from a checkpoint.
+            begins_again: clear the log first, because there is no checkpoint.
             files: the arrays of a new training that come from another run, by the names of their files.
         """
         keep_compiled(self._note)
         try:
             with self.recorder, jax.default_matmul_precision(self.options.precision):
+                if begins_again:
+                    self._begin_again()
                 initial.write(self.recorder.folder, files or {})
                 self._train(restore)
         except OSError as error:
@@ -111,10 +116,11 @@ class Session:
             self.recorder.finish(self.results)
             draw_curve(self.recorder)
 
-    def begin_again(self) -> None:
-        """Clear the log and begin at step 0, because there is no checkpoint. What was learned is set aside."""
+    def _begin_again(self) -> None:
+        """Clear the log, to begin at step 0. What was learned is set aside."""
         aside = set_aside(self.recorder.folder)
         self.recorder.rewind(dict.fromkeys(self.recorder.seeds, 0))
+        self.results = None
         kept = "" if aside is None else f"; the log and the agents until now are in {aside}"
         self._note(f"there is no checkpoint: begins again from step 0{kept}")
 
@@ -231,41 +237,51 @@ class Session:
         if not self._is_due(event, snapshot):
             return False
         self._look_at_networks(snapshot.seeds.state, event)  # networks are checked before each checkpoint
-        progress, asked = snapshot.progress, self.requests.number
-        self._wait()
-        if progress.refreshed and not self.last.refreshed:
-            self.checkpoints.forget_timesteps()
-        if event.phase is not Phase.FAULT:
-            self._save(snapshot)
-        if self._has_ended(progress):
-            return False
-        go_on = f"`beliefrl resume {as_argument(self.recorder)}` goes on from there"
-        go_on = f"{go_on}, in Python beliefrl.resume({self.recorder.shown!r})"
         if event.phase is Phase.FAULT:
-            try:  # the Fault itself is raised next
-                self._save(snapshot)
-                self.checkpoints.wait()
-                self._note(f"saved at step {progress.step:,}; {go_on}")
-            except (OSError, UserError) as error:
-                why = cause(error) if isinstance(error, OSError) else error
-                self._note(f"the checkpoint of step {progress.step:,} cannot be written ({why})")
-        elif asked:
+            self._save_at_fault(snapshot)
+            return False
+        step, asked = snapshot.progress.step, self.requests.number
+        self._save(snapshot)
+        if self._has_ended(snapshot.progress):
+            return False
+        if asked:
             self._wait()
             if self.failed:
                 self._save(snapshot)
-            raise Stopped(f"stopped at step {progress.step:,}; {go_on}.", asked)
-        elif self.ended or self.is_stopped:
-            self._note(self.ended or f"stopped by the callback at step {progress.step:,}; {go_on}")
+            raise Stopped(f"stopped at step {step:,}; {self._how_to_go_on}.", asked)
+        if self.ended or self.is_stopped:
+            self._note(self.ended or f"stopped by the callback at step {step:,}; {self._how_to_go_on}")
             return True
         return False
 
+    def _save_at_fault(self, snapshot: Snapshot) -> None:
+        """Write a checkpoint where an environment failed. The Fault is raised next, so an error here is only noted."""
+        step = snapshot.progress.step
+        try:
+            self._save(snapshot)
+            self.checkpoints.wait()
+            self._note(f"saved at step {step:,}; {self._how_to_go_on}")
+        except (OSError, UserError) as error:
+            why = cause(error) if isinstance(error, OSError) else error
+            self._note(f"the checkpoint of step {step:,} cannot be written ({why})")
+
+    @property
+    def _how_to_go_on(self) -> str:
+        command = f"`beliefrl resume {as_argument(self.recorder)}` goes on from there"
+        return f"{command}, in Python beliefrl.resume({self.recorder.shown!r})"
+
     def _save(self, snapshot: Snapshot) -> None:
+        self._wait()
+        if snapshot.progress.refreshed and not self.last.refreshed:
+            self.checkpoints.forget_timesteps()
         replay = snapshot.seeds.replay
         rest = snapshot.seeds._replace(replay=replay._replace(timesteps=()))
-        lost = sorted(self.lost)
-        progress = {"progress": list(snapshot.progress), "metrics": self.recorder.lengths(), "lost": lost}
-        progress["results"] = self.results
-        self._wait()
+        progress = {
+            "progress": list(snapshot.progress),
+            "metrics": self.recorder.lengths(),
+            "lost": sorted(self.lost),
+            "results": self.results,
+        }
         failed, self.failed = self.failed, False
         self.checkpoints.save(snapshot.progress.step, progress, rest, replay.timesteps, np.asarray(replay.added))
         if failed:

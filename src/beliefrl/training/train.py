@@ -1,10 +1,8 @@
 """`train` and `resume`: check the arguments and open the folder. `session` runs the training."""
 
 import contextlib
-import copy
 import dataclasses
 import os
-import pathlib
 from collections.abc import Iterator
 from typing import Any, Literal
 
@@ -12,28 +10,28 @@ from beliefrl import agents, tasks
 from beliefrl.agents import Agent, hyperparameters
 from beliefrl.errors import OfCallback
 from beliefrl.runs.checkpoint import listed, was_ever_written
-from beliefrl.runs.folder import free_folder, locked, write_config
+from beliefrl.runs.folder import free_folder
+from beliefrl.runs.options import NAMES, Options
+from beliefrl.runs.recorder import Recorder
 from beliefrl.runs.records import provenance
-from beliefrl.runs.run import Recorder, Run
+from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import checks, initial, initial_replay
-from beliefrl.training.phases import SeedState
 from beliefrl.training.restore import agent_of, check_interface, task_of
-from beliefrl.training.schedule import Event, Options, Snapshot, capacity
+from beliefrl.training.schedule import Event, capacity
 from beliefrl.training.session import Callback, Session
-from beliefrl.types import UserError, tuples
+from beliefrl.types import UserError
 
 
 def train(
     agent: Agent | str,
     task: Task | GymnasiumTask | str | type,
     out: str | os.PathLike[str] | None = None,
-    report: Callback | None = None,
+    callback: Callback | None = None,
     own_process: bool = False,
     progress: bool = True,
     resume: bool = False,
-    callback: Callback | None = None,
     **options: Any,
 ) -> Run:
     """Train an agent on a task and record it in a folder.
@@ -43,8 +41,7 @@ def train(
         task: a task, the name of one, or a class of Gymnasium environments.
         out: the run's folder; None is runs/AGENT-TASK-1, or the next free number. It must not exist, unless it is empty
             or a training left it that ended before it saved an agent or a checkpoint. Such a folder is used again.
-        report: called with every Event when it happens; its return value is ignored.
-        callback: the same, but it can stop the training. If it returns True, the training writes a checkpoint after
+        callback: called with every Event when it happens. If it returns True, the training writes a checkpoint after
             its current block of about 100 steps and stops; `resume` continues. Any other value, such as None, changes
             nothing. (In Stable-Baselines3 a callback returns False to stop.) Urgent notes come from another thread.
             An exception of the callback ends the training. Saved files are kept.
@@ -71,7 +68,7 @@ def train(
         Stopped: Ctrl-C, SIGTERM or SIGHUP, after a checkpoint is written; `resume` continues. It is a
             KeyboardInterrupt.
     """
-    checks.listeners(report=report, callback=callback)
+    checks.callback(callback)
     agent = agents.given(agent)
     made: Any = tasks.given(task)
     chosen = _chosen(options)
@@ -89,7 +86,7 @@ def train(
         run, own = Run(out), agent if agents.is_own(config["agent"]) else None
         checks.same(run, config, hyperparameters.values_before(agent))
         changes = {name: getattr(chosen, name) for name in checks.CHANGEABLE}
-        return _go_on(run, changes, made, (report, callback), own, own_process, progress)
+        return _go_on(run, changes, made, callback, own, own_process, progress)
     files = {}
     if chosen.init_from is not None:
         files[initial.FILE], config["initial"] = initial.taken(chosen, agent, made.spec)
@@ -97,7 +94,7 @@ def train(
         files[initial_replay.FILE], about = initial_replay.taken(chosen, agent, made, initial.seeds_there(chosen))
         config["initial"] |= about
     recorder = Recorder(out or free_folder(f"{config['agent']}-{config['task']}"), config)
-    with _reporting(recorder, report, callback, progress) as listen:
+    with _reporting(recorder, callback, progress) as listen:
         return Session(recorder, agent, made, chosen, listen, own_process).run(files=files)
 
 
@@ -105,11 +102,10 @@ def resume(
     run: Run | str | os.PathLike[str],
     steps: int | None = None,
     task: Task | GymnasiumTask | type | None = None,
-    report: Callback | None = None,
+    callback: Callback | None = None,
     agent: Agent | type | None = None,
     own_process: bool = False,
     progress: bool = True,
-    callback: Callback | None = None,
     stop_at: float | Literal["same"] | None = "same",
     step_timeout: float | Literal["same"] | None = "same",
     stop_patience: int | None = None,
@@ -124,7 +120,7 @@ def resume(
         run: a run, or its folder.
         steps: the total number of environment steps; None: as many as before. It cannot be reduced.
         task: needed only if the run was trained on a task of your own: that task, or the class of its environments.
-        report, own_process, progress, callback: as in `train`.
+        callback, own_process, progress: as in `train`.
         agent: needed only if an agent of your own was trained: its class, or an instance.
         stop_at: the option `stop_at` from now on; None: train for all steps; "same": as before. A training that has
             reached its `stop_at` is finished, and continues only with a higher one or None.
@@ -136,13 +132,13 @@ def resume(
             small, or `task` is another one.
         Stopped: Ctrl-C, SIGTERM or SIGHUP, after a checkpoint is written.
     """
-    checks.listeners(report=report, callback=callback)
+    checks.callback(callback)
     limits = {"stop_at": stop_at, "step_timeout": step_timeout}
     numbers = {"steps": steps, "stop_patience": stop_patience}
     changes: dict[str, Any] = {name: value for name, value in limits.items() if value != "same"}
     changes |= {name: value for name, value in numbers.items() if value is not None}
     run = run if isinstance(run, Run) else Run(run)
-    return _go_on(run, changes, task, (report, callback), agent, own_process, progress)
+    return _go_on(run, changes, task, callback, agent, own_process, progress)
 
 
 def _about_environment(task: GymnasiumTask) -> dict[str, Any]:
@@ -154,19 +150,19 @@ def _go_on(
     run: Run,
     changes: dict[str, Any],
     task: Any,
-    listeners: tuple[Callback | None, Callback | None],
+    callback: Callback | None,
     agent: Any,
     own_process: bool,
     progress: bool,
 ) -> Run:
-    """Continue a training; `changes` are its new options, `listeners` are `report` and `callback`."""
+    """Continue a training; `changes` are its new options. Nothing in the folder changes before `Session.run`."""
     folder, shown, made_by = run.folder, run.shown, agent_of(run, agent)
     if all(map(run.has_diverged, run.seeds)):  # another try would select the seeds that survive
         raise UserError(f"All seeds of {shown} have diverged: train with other settings, and with another --out.")
-    begins_again = not was_ever_written(folder) and not _is_finished(run)
+    begins_again = not was_ever_written(folder) and not run.is_complete(run.options)
     if not (begins_again or listed(folder)):
         raise UserError(f"{shown} has no usable checkpoint left: train again, with another --out.")
-    _ = Options(**_options(run) | changes)  # raise before the folder is locked
+    _ = dataclasses.replace(_options(run), **changes)  # raise before the folder is locked
     with contextlib.ExitStack() as showing, contextlib.ExitStack() as stack:
         recorder = stack.enter_context(Recorder(folder, None))
         recorder.given = run.given
@@ -175,63 +171,27 @@ def _go_on(
             checks.same_task(recorder, made)
         check_interface(run, made)
         before = _options(recorder)
-        steps = changes.get("steps", before["steps"])
-        if steps < before["steps"]:
-            raise UserError(f"steps={steps} is impossible: {shown} trains for {before['steps']}, and may only grow.")
-        options = Options(**before | changes)
+        options = dataclasses.replace(before, **changes)
+        if options.steps < before.steps:
+            raise UserError(
+                f"steps={options.steps} is impossible: {shown} trains for {before.steps}, and may only grow."
+            )
         if options.stop_at is None and "stop_patience" not in changes:
             options = dataclasses.replace(options, stop_patience=1)
         checks.patience(options)
         checks.higher(recorder, options)
         _ = capacity(made_by, options)  # raise before the run's config changes
         checks.possible(options, made, own_process)
-        earlier = copy.deepcopy(recorder.config)
-        stack.callback(_put_back, folder, earlier)  # if something fails before the training begins
         recorder.amend({"options": dataclasses.asdict(options)}, provenance())
-        listen = showing.enter_context(_reporting(recorder, *listeners, progress))
+        listen = showing.enter_context(_reporting(recorder, callback, progress))
         training = Session(recorder, made_by, made, options, listen, own_process)
-        if begins_again:
-            training.begin_again()
         stack.pop_all()
-        return training.run() if begins_again else _run_restored(training, earlier)
-
-
-def _run_restored(training: Session, earlier: dict[str, Any]) -> Run:
-    """Continue from a checkpoint. If that fails before it is read, the run has its `earlier` config again."""
-    read = []
-
-    def restore(shapes: SeedState) -> Snapshot:
-        read.append(training.restore(shapes))
-        return read[0]
-
-    try:
-        return training.run(restore)
-    finally:
-        if not read:
-            with contextlib.suppress(UserError), locked(training.recorder.folder, "is being trained"):
-                _put_back(training.recorder.folder, earlier)
-
-
-def _is_finished(run: Run) -> bool:
-    """Whether the run was evaluated at its last step and saved, or has reached its `stop_at`.
-
-    A log that ends at the last step is not enough: the run may have been killed before it wrote its checkpoint.
-    """
-    step = (run.results() or {}).get("step") or 0
-    return step >= run.options.steps or run.reached(run.options.stop_at, run.options.stop_patience)
-
-
-def _put_back(folder: pathlib.Path, config: dict[str, Any]) -> None:
-    with contextlib.suppress(OSError):
-        write_config(folder, config)
+        return training.run(None if begins_again else training.restore, begins_again=begins_again)
 
 
 @contextlib.contextmanager
-def _reporting(run: Run, report: Callback | None, callback: Callback | None, progress: bool) -> Iterator[Callback]:
-    """A function that calls the display (unless `progress` is False), `report` and `callback` with an Event.
-
-    It returns what `callback` returns.
-    """
+def _reporting(run: Run, callback: Callback | None, progress: bool) -> Iterator[Callback]:
+    """A function that calls the display (unless `progress` is False) and `callback`, and returns what this returns."""
     with contextlib.ExitStack() as stack:
         display: Callback | None = None
         if progress:
@@ -244,8 +204,6 @@ def _reporting(run: Run, report: Callback | None, callback: Callback | None, pro
             if display is not None:
                 display(event)
             try:
-                if report is not None:
-                    report(event)
                 return None if callback is None else callback(event)
             except OSError as error:
                 raise OfCallback from error
@@ -258,11 +216,10 @@ def _reporting(run: Run, report: Callback | None, callback: Callback | None, pro
 
 def _chosen(options: dict[str, Any]) -> Options:
     """The options that were given by name."""
-    known = [field.name for field in dataclasses.fields(Options)]
     for name in options:
-        if name not in known:
+        if name not in NAMES:
             raise UserError(
-                f"Training has no option {name!r}: it has {', '.join(known)}. Give hyperparameters to make_agent, and "
+                f"Training has no option {name!r}: it has {', '.join(NAMES)}. Give hyperparameters to make_agent, and "
                 "observe to make_task."
             )
     source = options.get("init_from")
@@ -273,10 +230,9 @@ def _chosen(options: dict[str, Any]) -> Options:
     return made
 
 
-def _options(run: Run) -> dict[str, Any]:
-    """The options that a run was trained with."""
-    known = {field.name for field in dataclasses.fields(Options)}
+def _options(run: Run) -> Options:
+    """The options that a run was trained with. Raise a UserError if this version lacks one of them."""
     for name in run.config["options"]:
-        if name not in known:
+        if name not in NAMES:
             raise UserError(f"{run.shown} was trained by another version: this one has no option {name!r}.")
-    return {"steps": Options.steps} | tuples(run.config["options"])
+    return run.options
