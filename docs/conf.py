@@ -23,8 +23,12 @@ jax.Array.__name__ = "Array"  # jaxlib._jax.Array before JAX 0.11; jaxtyping sho
 
 import beliefrl  # noqa: E402 - after the name is set
 
-NOTEBOOK = "../examples/tutorial.ipynb"  # Sphinx shows only what lies in its own folder, so it gets a copy
-shutil.copy(pathlib.Path(__file__).parent / NOTEBOOK, pathlib.Path(__file__).parent)
+COPIES = {  # Sphinx shows only what lies in its own folder, so it gets copies
+    "../examples/tutorial.ipynb": "tutorial.ipynb",
+    "../benchmarks/README.md": "benchmarks.md",
+}
+for original, copied in COPIES.items():
+    shutil.copy(pathlib.Path(__file__).parent / original, pathlib.Path(__file__).parent / copied)
 
 
 project = html_title = "BeliefRL"
@@ -65,16 +69,19 @@ STAR = re.compile(r"(?<![`\w])\*(?=\w)")  # in a shape such as (*batch, obs), no
 
 def setup(app: Sphinx) -> dict[str, Any]:
     """Connect the functions below. Sphinx calls this."""
-    app.connect("source-read", link_to_copy)
+    app.connect("source-read", link_to_copies)
     app.connect("autodoc-process-docstring", rewrite)
     app.connect("autodoc-process-signature", without_fields)
     app.connect("autodoc-skip-member", skip_methods_of_agents)
     return {"parallel_read_safe": True}
 
 
-def link_to_copy(app: Sphinx, page: str, content: list[str]) -> None:
-    """Let links to the notebook lead to the copy."""
-    content[0] = content[0].replace(f"]({NOTEBOOK})", "](tutorial.ipynb)")
+def link_to_copies(app: Sphinx, page: str, content: list[str]) -> None:
+    """Let links to the originals lead to the copies, and links in a copy to the pages here."""
+    for original, copied in COPIES.items():
+        content[0] = content[0].replace(original, copied)
+        if page == pathlib.Path(copied).stem:
+            content[0] = content[0].replace("](../docs/", "](")
 
 
 def rewrite(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
