@@ -41,8 +41,9 @@ for example
   beliefrl train my_module:MyAgent pendulum-p
 
 COMMAND --help shows the options of a command; `beliefrl train AGENT --help` also the agent's hyperparameters,
-with their defaults and their place in the paper. AGENT is a name that `beliefrl agents` lists, or MODULE:CLASS, an
-agent of your own in this folder or on the Python path. Commands that read its runs need --agent MODULE:CLASS.
+with their defaults and where the paper gives them (table or appendix). AGENT is a name that `beliefrl agents` lists, or
+MODULE:CLASS, an agent of your own in this folder or on the Python path. Commands that read its runs need --agent
+MODULE:CLASS.
 
 A run's folder contains config.json, metrics/ (a line of JSON for every entry), tensorboard/, checkpoints/, the trained
 agents, results.json and curve.png. Ctrl-C writes a checkpoint first. A mistake ends the command with an error message
