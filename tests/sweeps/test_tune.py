@@ -436,8 +436,12 @@ def test_an_agent_of_ones_own_has_ranges_or_gets_them():
         ranges.chosen(Own(), "m:Own", {}, fixed=["rate"])
 
 
-def test_the_command_gives_everything_to_the_search(monkeypatch, capsys, tmp_path):
+@pytest.mark.parametrize("pictures", [["history.png"], ["history.png", "importance.png"]])
+def test_the_command_gives_everything_to_the_search(monkeypatch, capsys, tmp_path, pictures):
     asked = {}
+    (tmp_path / "my search").mkdir()
+    for name in pictures:
+        (tmp_path / "my search" / name).touch()
 
     def search(**given):
         asked.update(given)
@@ -473,6 +477,7 @@ def test_the_command_gives_everything_to_the_search(monkeypatch, capsys, tmp_pat
     out = capsys.readouterr().out
     assert "2 trials, 1 complete, 1 failed" in out
     assert "1 failed: it broke" in out
+    assert f"my search has {' and '.join(pictures)}; `beliefrl report" in out
     assert f"`beliefrl report '{tmp_path / 'my search'}' --unfinished`" in out
     assert "tau=0.1" in out
     assert out.endswith("beliefrl train vrm pendulum-v\n")

@@ -14,6 +14,7 @@ from beliefrl.commands.arguments import named_values, parse, value_lists
 from beliefrl.errors import UserError
 
 SHOWN = 5  # of the best trials
+PICTURES = ("history.png", "importance.png")  # the second needs two complete trials with different objectives
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +84,8 @@ def tune(argv: Sequence[str]) -> None:
         print(f"{count} failed: {why or 'stopped before the training began'}")
     folder = tuned.study.parent
     shows = f"`beliefrl report {shlex.quote(str(folder))} --unfinished` shows the trials"
-    print(f"{folder} has history.png and importance.png; {shows}")
+    pictures = [name for name in PICTURES if (folder / name).exists()]
+    print(f"{folder} has {' and '.join(pictures)}; {shows}")
     print("this trains the best settings with new seeds:\n")
     print(tuned.command)  # one line, to be copied
 
