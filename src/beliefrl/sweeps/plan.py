@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from beliefrl import agents, tasks
-from beliefrl.catalogue import unmasked
+from beliefrl.catalogue import split_mask
 from beliefrl.runs.folder import folder_name
 from beliefrl.runs.options import Options
 from beliefrl.runs.run import Run
@@ -154,7 +154,7 @@ GAIN_SIDE_BY_SIDE = ("sac-mlp",)
 
 def _seed_ranges(experiment: Experiment, seeds_per_run: int | None) -> list[tuple[int, int]]:
     """The experiment's seeds, split into runs of consecutive seeds: (first seed, number of seeds)."""
-    compiled = unmasked(experiment.task) in tasks.TASKS
+    compiled = split_mask(experiment.task)[0] in tasks.TASKS
     gains = compiled and experiment.agent in GAIN_SIDE_BY_SIDE
     most = seeds_per_run or (len(experiment.seeds) if gains else 1)
     ranges: list[tuple[int, int]] = []
