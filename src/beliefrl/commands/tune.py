@@ -70,14 +70,13 @@ def tune(argv: Sequence[str]) -> None:
 
     from beliefrl.sweeps.tune import tune as search
 
-    same = ("agent", "task", "trials", "seeds", "seed", "only", "observe", "objective", "actions", "prune", "workers")
-    tuned = search(
-        ranges=_ranges(options.range),
-        settings=_settings(options),
-        constants=named_values(options.constants, "--constants"),
-        out=options.out,
-        **{name: getattr(options, name) for name in same},
-    )
+    changed: dict[str, Any] = {
+        "ranges": _ranges(options.range),
+        "settings": _settings(options),
+        "constants": named_values(options.constants, "--constants"),
+    }
+    same = {name: value for name, value in vars(options).items() if name not in ("range", "set", "steps")}
+    tuned = search(**same | changed)
     console = Console()
     console.print(_table(tuned))
     for why, count in Counter(trial.why for trial in tuned.trials if trial.state == "failed").items():
