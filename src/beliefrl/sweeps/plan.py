@@ -23,7 +23,7 @@ from beliefrl.runs.run import Run
 from beliefrl.sweeps.experiments import Experiment
 from beliefrl.tasks.faults import Faults
 from beliefrl.training.schedule import capacity
-from beliefrl.types import UserError, plain
+from beliefrl.types import UserError, plain, tuples
 
 OPTIONS = tuple(field.name for field in dataclasses.fields(Options))
 FAULTS = tuple(field.name for field in dataclasses.fields(Faults))
@@ -233,9 +233,9 @@ def _typed(values: dict[str, Any], like: Any) -> dict[str, Any]:
     def typed(name: str, value: Any) -> Any:
         if isinstance(value, int) and not isinstance(value, bool) and isinstance(getattr(like, name, None), float):
             return float(value)
-        return tuple(value) if isinstance(value, list) else value
+        return value
 
-    return {name: typed(name, value) for name, value in values.items()}
+    return {name: typed(name, value) for name, value in tuples(values).items()}
 
 
 def _flag(name: str, value: Any) -> list[str]:

@@ -74,8 +74,8 @@ def sweep(
     """
     if not isinstance(experiments, Sequence) or not all(isinstance(each, Experiment) for each in experiments):
         raise UserError("experiments must be a list of beliefrl.Experiment: beliefrl.grid makes one.")
-    check_whole("workers", 0 if workers is None else workers, 0)
-    check_whole("seeds_per_run", 1 if seeds_per_run is None else seeds_per_run, 1)
+    check_whole("workers", workers, 0, optional=True)
+    check_whole("seeds_per_run", seeds_per_run, 1, optional=True)
     if ray is not None and not isinstance(ray, str):
         raise UserError(f"ray={short(ray)} is impossible: give HOST:PORT of the head, or auto.")
     folder = as_path(out)

@@ -142,7 +142,7 @@ def _run(folder: pathlib.Path, search: Search, trials: int, prune: bool, workers
 
 def _check(trials: int, seeds: int, seed: int, workers: int | None, objective: str, actions: str) -> None:
     check_whole("trials", trials, 1)
-    check_whole("workers", 1 if workers is None else workers, 1)
+    check_whole("workers", workers, 1, optional=True)
     Options(seeds=seeds, seed=seed)
     for name, value, known in (("objective", objective, Objective), ("actions", actions, Actions)):
         if value not in get_args(known):
