@@ -93,7 +93,9 @@ def sweep(
             sources.write(folder, trainings)
             status = _status(folder, trainings)
             with reporting(folder, report, progress) as listen, Requests(confirm) as requests:
-                _loop(folder, status, launcher, listen, requests)
+                of_sweep = folder, status, launcher
+                step, stop = functools.partial(_step, *of_sweep), functools.partial(_stop, *of_sweep)
+                loop(status, step, listen, requests, stop, LOOK_EVERY)
         finally:
             launcher.stop()  # also closes the connection to a Ray cluster
     if status.failed:
@@ -176,27 +178,47 @@ def _status(folder: pathlib.Path, trainings: Sequence[Training]) -> SweepStatus:
     return SweepStatus(finished, [training for training in trainings if training not in finished])
 
 
-def _loop(folder: pathlib.Path, status: SweepStatus, launcher: Launcher, report: Report, requests: Requests) -> None:
+def loop(
+    status: SweepStatus,
+    step: Callable[[], None],
+    report: Report,
+    requests: Requests,
+    stop: Callable[[], str],
+    every: float,
+) -> None:
+    """Call `step` and `report` every `every` seconds, until no training waits or runs.
+
+    At a signal, `stop` stops the trainings and returns the sentence of the Stopped that is raised.
+    """
     while True:
-        while launcher.room > 0 and (training := take(status, folder)):
-            launcher.start(training)
-            status.running[training.name] = training
-        for name, code in launcher.ended().items():
-            training = status.running.pop(name)
-            if code == 0:
-                status.finished.append(training)
-            else:
-                status.failed[name] = reason(folder / "logs" / f"{name}.log", code)
+        step()
         report(status)
         if requests.number:
-            launcher.stop()
-            finished = status.finished + [each for each in status.running.values() if each.is_finished(folder)]
-            done = f"{len(finished)} of {status.count}"  # some finish while they are asked to stop
-            go_on = f"`beliefrl sweep --out {shlex.quote(str(folder))}` continues."
-            raise Stopped(f"stopped with {done} trainings finished; {go_on}", requests.number)
+            raise Stopped(stop(), requests.number)
         if not (status.waiting or status.running):
             return
-        time.sleep(LOOK_EVERY)
+        time.sleep(every)
+
+
+def _step(folder: pathlib.Path, status: SweepStatus, launcher: Launcher) -> None:
+    """Start what there is room for, and collect what has ended."""
+    while launcher.room > 0 and (training := take(status, folder)):
+        launcher.start(training)
+        status.running[training.name] = training
+    for name, code in launcher.ended().items():
+        training = status.running.pop(name)
+        if code == 0:
+            status.finished.append(training)
+        else:
+            status.failed[name] = reason(folder / "logs" / f"{name}.log", code)
+
+
+def _stop(folder: pathlib.Path, status: SweepStatus, launcher: Launcher) -> str:
+    launcher.stop()
+    finished = status.finished + [each for each in status.running.values() if each.is_finished(folder)]
+    done = f"{len(finished)} of {status.count}"  # some finish while they are asked to stop
+    go_on = f"`beliefrl sweep --out {shlex.quote(str(folder))}` continues."
+    return f"stopped with {done} trainings finished; {go_on}"
 
 
 def reason(log: pathlib.Path, code: int) -> str:
