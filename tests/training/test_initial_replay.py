@@ -105,13 +105,12 @@ def test_timesteps_of_another_task_are_one_sentence_and_no_folder(source, tmp_pa
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("memory", ["reward_memory", "observation_memory"])
-def test_other_notes_are_one_sentence(tmp_path, memory):
-    for now in ((16.0,), ()):
-        old, new = (tiny("predictive-sac", **{memory: constants}) for constants in ((8.0,), now))
-        run = saved(tmp_path / str(len(now)), "predictive-sac", TASK, agent=old)
-        with pytest.raises(UserError, match=rf"{memory}=\[8.0\], and"):
-            initial_replay.taken(Options(init_from=str(run.folder)), new, TASK, [0])
+@pytest.mark.parametrize("name", ["store_state", "store_first_impression"])
+def test_other_notes_are_one_sentence(tmp_path, name):
+    old, new = (tiny("vrm", **{name: stores}) for stores in (True, False))
+    run = saved(tmp_path / "run", "vrm", TASK, agent=old)
+    with pytest.raises(UserError, match=rf"{name}=True, and this training has False"):
+        initial_replay.taken(Options(init_from=str(run.folder)), new, TASK, [0])
 
 
 def test_the_replay_of_a_diverged_seed_is_not_taken(tmp_path):

@@ -1,5 +1,6 @@
 """A training from beginning to end, as a user starts it: what it leaves, says and survives, where it starts."""
 
+import dataclasses
 import json
 import os
 import pathlib
@@ -304,6 +305,35 @@ def test_other_meanings_of_equal_arrays_are_one_sentence(tmp_path, name, setting
     source = saved(tmp_path / "source", name, TASK, agent=tiny(name, **{setting: True}))
     with pytest.raises(UserError, match=r"trained with \S+=\S+, and this training has \S+; set \S+="):
         train(tiny(name, **({other: True} if other else {})), TASK, tmp_path / "run", init_from=source)
+
+
+@dataclasses.dataclass(frozen=True)
+class Flipped(type(AGENT)):
+    """An agent of a user's whose settings have no arrays."""
+
+    flipped: bool = False
+    scales: tuple[float, ...] = ()
+    network_settings = ("flipped", "scales")
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "phrase"),
+    [
+        ({"flipped": True}, {}, "flipped=True, and this training has False; set flipped=True"),
+        ({}, {"scales": (1.0,)}, r"scales=\[\], and this training has \[1.0\]"),
+        ({"scales": (1.0,)}, {"scales": (2.0,)}, r"scales=\[1.0\], and this training has \[2.0\]"),
+    ],
+)
+def test_an_agent_of_ones_own_names_what_must_agree(tmp_path, before, now, phrase):
+    old, new = (Flipped(**{**vars(AGENT), **changes}) for changes in (before, now))
+    source = saved(tmp_path / "source", "mine:Flipped", TASK, agent=old)
+    for name in {"flipped", "scales"} - before.keys():  # a run from before a setting had its default
+        del source.config["hyperparameters"][name]
+    (source.folder / "config.json").write_text(json.dumps(source.config))
+    options = Options(init_from=str(source.folder))
+    initial.taken(options, old, TASK.spec)
+    with pytest.raises(UserError, match=phrase):
+        initial.taken(options, new, TASK.spec)
 
 
 @pytest.mark.parametrize("envs", [1, 16])

@@ -27,7 +27,7 @@ from beliefrl.types import UserError, plain, tuples
 
 OPTIONS = tuple(field.name for field in dataclasses.fields(Options))
 FAULTS = tuple(field.name for field in dataclasses.fields(Faults))
-SHRINKS = ("step_start_rl", "train_times_fivrm", "pretrain_updates")  # hyperparameters that count steps or updates
+SHRINKS = ("step_start_rl", "train_times_fivrm", "pretrain_updates")  # they count what comes before learning
 LONGEST_NAME = 120  # characters of a folder's name, without the seeds
 
 
