@@ -322,7 +322,7 @@ def test_what_was_learned_before_a_fault_is_kept(tmp_path):
         assert [row["step"] for row in run.rows(seed, "evaluation")] == [20]
         assert [row["length"] for row in run.rows(seed, "episode")] == [10, 10]
         assert [row["step"] for row in run.rows(seed, "update")][-1] == 26  # as far as it came
-    _, origin = initial.taken(Options(init_from=str(run.folder), seed=5), agent, GymnasiumTask(Fine).spec)
+    _, origin = initial.taken(run, Options(seed=5), agent, GymnasiumTask(Fine).spec)
     assert origin["seeds"][5] == {"seed": 5, "step": 26}
     action, _ = load(run, task=Fine).predict(np.zeros(2))
     with pytest.raises(UserError, match="on all entries of the observation, and the given task shows entries 1 0"):

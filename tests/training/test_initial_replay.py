@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from beliefrl import UserError, resume, tasks, train
+from beliefrl import Run, UserError, resume, tasks, train
 from beliefrl.runs import arrays
 from beliefrl.runs.checkpoint import Checkpoints, listed
 from beliefrl.runs.options import Options
@@ -49,7 +49,7 @@ def written(folder, capacity, added, first=None):
 
 
 def taken(run, seeds=(0, 1), **options):
-    return initial_replay.taken(Options(init_from=str(run.folder), **options), AGENT, TASK, list(seeds))
+    return initial_replay.taken(run, Options(**options), AGENT, TASK, list(seeds))
 
 
 def test_each_seed_has_the_timesteps_of_its_own_ring_in_order(source):
@@ -110,7 +110,7 @@ def test_other_notes_are_one_sentence(tmp_path, name):
     old, new = (tiny("vrm", **{name: stores}) for stores in (True, False))
     run = saved(tmp_path / "run", "vrm", TASK, agent=old)
     with pytest.raises(UserError, match=rf"{name}=True, and this training has False"):
-        initial_replay.taken(Options(init_from=str(run.folder)), new, TASK, [0])
+        initial_replay.taken(run, Options(), new, TASK, [0])
 
 
 def test_the_replay_of_a_diverged_seed_is_not_taken(tmp_path):
@@ -176,4 +176,4 @@ def test_actions_with_other_bounds_are_one_sentence(tmp_path):
     config["interface"] = GymnasiumTask(Fine).interface._asdict()
     (run.folder / "config.json").write_text(json.dumps(config))
     with pytest.raises(UserError, match=r"another environment: lower bounds of the actions before: \[-2.0\]"):
-        initial_replay.taken(Options(init_from=str(run.folder)), AGENT, task, [0])
+        initial_replay.taken(Run(run.folder), Options(), AGENT, task, [0])

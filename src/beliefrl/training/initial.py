@@ -25,22 +25,20 @@ from beliefrl.types import Spec, UserError, plain
 FILE = "initial.safetensors"
 
 
-def seeds_there(options: Options) -> list[int]:
+def seeds_there(source: Run, options: Options) -> list[int]:
     """The index of the seed in the other run, for each seed of this training."""
-    source = Run(options.init_from or "")
     return [(seed - source.seeds[0]) % len(source.seeds) for seed in range(options.seed, options.seed + options.seeds)]
 
 
-def taken(options: Options, agent: Agent, spec: Spec) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def taken(source: Run, options: Options, agent: Agent, spec: Spec) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The initial networks of all seeds by their names, and where they come from, for config.json.
 
-    Seed n starts from seed n of the other run. If the other run has fewer seeds, its seeds are reused in a cycle.
+    Seed n starts from seed n of the other run, `source`. If it has fewer seeds, its seeds are reused in a cycle.
 
     Raises:
-        UserError: there is no such run, it has no trained agent, its agent was not pre-trained, or the agents differ in
+        UserError: the other run has no trained agent, its agent was not pre-trained, or the agents differ in
             an array or in one of `network_settings`.
     """
-    source = Run(options.init_from or "")
     path = source.agents(options.init_best)
     try:
         saved = _fitting(source, arrays.load(path), agent, spec)
@@ -49,7 +47,7 @@ def taken(options: Options, agent: Agent, spec: Spec) -> tuple[dict[str, np.ndar
             _refuse_other_settings(source, agent)  # a hyperparameter says more than the first array that differs
         raise
     _refuse_other_settings(source, agent)
-    seeds, index = range(options.seed, options.seed + options.seeds), seeds_there(options)
+    seeds, index = range(options.seed, options.seed + options.seeds), seeds_there(source, options)
     ends = best.evaluations(source.folder, len(source.seeds)) if options.init_best else _last_steps(source)
     _refuse_untrained(source, agent, [ends[at] for at in index])
     session = sessions(source.config)[-1]

@@ -28,17 +28,18 @@ FILE = "initial-replay.safetensors"
 ADDED = "added"  # the number of timesteps of each ring, among the arrays of the file
 
 
-def taken(options: Options, agent: Agent, task: Any, seeds: list[int]) -> tuple[dict[str, np.ndarray], dict[str, int]]:
+def taken(
+    source: Run, options: Options, agent: Agent, task: Any, seeds: list[int]
+) -> tuple[dict[str, np.ndarray], dict[str, int]]:
     """The timesteps of all rings by their names, and what config.json says of them.
 
     The arrays have the shape (seed, [env,] time, ...). A shorter ring is padded at its end. `seeds` has the index of
-    the seed in the other run, for each seed of this training.
+    the seed in the other run, `source`, for each seed of this training.
 
     Raises:
-        UserError: that run was trained on another task, with other bounds of the actions, other `envs` or other notes,
-            it has no undamaged checkpoint, or its timesteps are not finite.
+        UserError: the other run was trained on another task, with other bounds of the actions, other `envs` or other
+            notes, it has no undamaged checkpoint, or its timesteps are not finite.
     """
-    source = Run(options.init_from or "")
     _same(source, agent, task, options.envs)
     check_interface(source, task)
     step, files = stored_timesteps(source.folder)
