@@ -38,6 +38,8 @@ class Launcher(Protocol):
 
     @property
     def room(self) -> int: ...
+    @property
+    def has_gpus(self) -> bool: ...
     def start(self, training: Training) -> None: ...
     def ended(self) -> dict[str, int]: ...
     def stop(self) -> None: ...
@@ -83,11 +85,10 @@ def sweep(
     with writing(folder), lock(folder):
         before = sources.read(folder)
         _check_named(folder, before, experiments)
-        slots = [] if ray else ["-"] if workers == 0 else places.slots(workers)
+        slots = [] if ray else [places.Slot()] if workers == 0 else places.slots(workers)
         launcher = places.Cluster(folder, ray, workers) if ray else places.Local(folder, slots)
         try:
-            on_gpu = launcher.has_gpus if isinstance(launcher, places.Cluster) else slots[0].startswith("gpu")
-            together = seeds_per_run or (ALL if on_gpu else None)
+            together = seeds_per_run or (ALL if launcher.has_gpus else None)
             trainings = plans.extended(before, experiments, together)
             _check_options(folder, trainings)
             sources.write(folder, trainings)
