@@ -16,6 +16,7 @@ import statistics
 import subprocess
 import tempfile
 import time
+from functools import partial
 
 import gymnasium
 import jax
@@ -29,6 +30,7 @@ from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import host_loop as loop
 from beliefrl.training import phases
 from beliefrl.training.bench import Noise
+from beliefrl.training.lockstep import Lockstep
 from beliefrl.training.rounds import stretch_length
 
 NAMES = ("vrm", "predictive-sac", "sac-mlp", "sac-lstm", "slac")
@@ -86,7 +88,7 @@ def host_loop(
         stretch = stretch_length(agent)
         programs = (
             phases.compile_program(agent, Noise(obs, actions), capacity, 1),
-            loop.program(agent, environment, capacity, 1, range(seeds), "never"),
+            loop.program(agent, environment, capacity, 1, range(seeds), partial(Lockstep, environment)),
         )
         state = [program.explore(program.begin(keys), 0, stretch)[0] for program in programs]
         times: tuple[list[float], list[float]] = ([], [])
@@ -186,7 +188,7 @@ def overlap(
         stretch = stretch_length(agent)
         for wait in waits:
             environment = GymnasiumTask(SlowEnvironment, "slow", {"obs": 6, "actions": 3, "wait": wait}, max_steps=1000)
-            place = agent, environment, 125_000, 1, range(1), "never"
+            place = agent, environment, 125_000, 1, range(1), partial(Lockstep, environment)
             programs = [loop.program(*place, overlap=overlapping) for overlapping in (False, True)]
             states = [program.explore(program.begin(keys), 0, stretch)[0] for program in programs]
             times: tuple[list[float], list[float]] = ([], [])

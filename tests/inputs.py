@@ -145,6 +145,8 @@ def flat(*returns):
 class Places:
     """The part of `sweeps.places.Local` that counts free slots, for fake trainings."""
 
+    has_gpus = False
+
     def __init__(self, folder, slots):
         self.folder, self.slots, self.running = folder, slots, {}
 

@@ -53,7 +53,7 @@ def test_the_best_agent_acts_if_it_is_asked_for(run, only_best, acts):
 
 
 def test_a_training_starts_from_the_best_agent_of_its_seed(run):
-    networks, origin = initial.taken(Options(init_from=str(run.folder), init_best=True, seed=5), AGENT, TASK.spec)
+    networks, origin = initial.taken(run, Options(init_from=run.shown, init_best=True, seed=5), AGENT, TASK.spec)
     there, last = arrays.load(run.agents(best=True)), arrays.load(run.agents())
     for name, array in networks.items():
         np.testing.assert_array_equal(array, there[name][[1]])
@@ -64,5 +64,5 @@ def test_a_training_starts_from_the_best_agent_of_its_seed(run):
 
 def test_a_best_agent_from_before_the_pretraining_is_refused(run):
     with pytest.raises(UserError, match=rf"its agent was saved at step {EARLY:,}, before the pre-training"):
-        initial.taken(Options(init_from=str(run.folder), init_best=True, seed=4), AGENT, TASK.spec)
-    initial.taken(Options(init_from=str(run.folder), seed=4), AGENT, TASK.spec)
+        initial.taken(run, Options(init_from=run.shown, init_best=True, seed=4), AGENT, TASK.spec)
+    initial.taken(run, Options(seed=4), AGENT, TASK.spec)

@@ -118,9 +118,10 @@ def written(path: str) -> dict[str, Any]:
     return values
 
 
-def unmasked(task: str) -> str:
-    """The name of a task without -v or -p."""
-    return task.removesuffix("-v").removesuffix("-p")
+def split_mask(task: str) -> tuple[str, str | None]:
+    """The name of a task without -v or -p, and which entries it shows: "velocities", "positions", or None for all."""
+    mask = task[-2:]
+    return (task[:-2], MASKS[mask]) if mask in MASKS else (task, None)
 
 
 @functools.cache
@@ -129,7 +130,7 @@ def usual_constants(task: str) -> dict[str, Any] | None:
 
     Those of a `gym:ID` are its arguments, which are all given by the user.
     """
-    base = unmasked(task)
+    base, _ = split_mask(task)
     if base in TASKS:
         return {
             name: list(value) if isinstance(value, tuple) else value for name, value in written(TASKS[base]).items()
@@ -254,11 +255,11 @@ def register() -> None:
 
     for identifier, name in registered_ids().items():
         if identifier not in registration.registry:
-            path = TASKS[name if name in TASKS else name[:-2]]
+            base, _ = split_mask(name)
             registration.register(
                 identifier,
                 entry_point="beliefrl.tasks.environment:TaskEnvironment",
-                max_episode_steps=written(path)["max_steps"],
+                max_episode_steps=written(TASKS[base])["max_steps"],
                 kwargs={"task": name},
             )
 

@@ -49,8 +49,10 @@ def check_range(settings: Any, names: Sequence[str], low: int | float, high: int
             raise UserError(f"{name}={value} is impossible: it must be {what} {_bounds(low, high, too_large)}.")
 
 
-def check_whole(name: str, value: Any, low: int, high: int = LARGEST) -> None:
-    """Raise a UserError if the value of an argument is not a whole number in [low, high]."""
+def check_whole(name: str, value: Any, low: int, high: int = LARGEST, optional: bool = False) -> None:
+    """Raise a UserError if the value of an argument is not a whole number in [low, high], or None if `optional`."""
+    if optional and value is None:
+        return
     if not _is_number(value, whole=True) or not low <= value <= high:
         bounds = _bounds(low, high, too_large=_is_number(value, whole=True) and value > high)
         raise UserError(f"{name}={short(value)} is impossible: it must be a whole number {bounds}.")

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import pathlib
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.export
@@ -20,6 +21,7 @@ from beliefrl.policy import Policy
 from beliefrl.tasks.environment import TaskEnvironment
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import host_loop, phases
+from beliefrl.training.lockstep import Lockstep
 from beliefrl.types import UserError, tuples
 from beliefrl.viewing.episodes import Player
 from worlds import Counting, CountingAgent, installed
@@ -198,7 +200,7 @@ def program(request):
     if request.param == "compiled":
         yield phases.compile_program(AGENT, TASK, 60, 3)
     else:
-        program = host_loop.program(AGENT, HOSTED, 60, 3, range(2), "never")
+        program = host_loop.program(AGENT, HOSTED, 60, 3, range(2), partial(Lockstep, HOSTED))
         yield program
         program.close()
 

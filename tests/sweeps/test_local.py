@@ -41,7 +41,7 @@ def rows(folder):
 
 def test_a_training_that_fails_frees_its_core_and_says_why(tmp_path):
     (tmp_path / "logs").mkdir()
-    launcher = places.Local(tmp_path, ["0"])
+    launcher = places.Local(tmp_path, [places.Slot("0")])
     launcher.start(Training("wrong", "vmr", "pendulum", {}, {"steps": 1, "seed": 0, "seeds": 1}))
     assert launcher.room == 0
     while not (codes := launcher.ended()):
@@ -88,17 +88,20 @@ def test_a_cluster_that_has_shrunk_has_no_room():
         assert cluster.room == room
 
 
-def test_there_is_a_slot_for_each_core_and_no_more_than_asked_for(monkeypatch):
+def test_there_is_a_slot_for_each_core_and_no_more_than_asked_for(tmp_path, monkeypatch):
     monkeypatch.setattr(places, "_gpus", lambda: 0)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3, 1, 2}, raising=False)
-    assert places.slots() == ["1", "2", "3"]
-    assert places.slots(3) == ["1", "2", "3"]
-    assert places.slots(2) == ["any"] * 2  # another sweep may use the other core
-    assert places.slots(4) == ["any"] * 4
+    one_thread = {"NPROC": "1"}
+    assert places.slots() == places.slots(3) == [(core, one_thread) for core in ("1", "2", "3")]
+    assert places.slots(2) == [("-", one_thread)] * 2  # another sweep may use the other core
+    assert places.slots(4) == [("-", one_thread)] * 4
+    assert not places.Local(tmp_path, places.slots()).has_gpus
     monkeypatch.setattr(places, "_gpus", lambda: 2)
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
-    assert places.slots() == places.slots(3) == ["gpu0", "gpu1"]
-    assert places.slots(1) == ["gpu0"]
+    gpus = [("-", {"CUDA_VISIBLE_DEVICES": name}) for name in ("0", "1")]
+    assert places.slots() == places.slots(3) == gpus
+    assert places.slots(1) == gpus[:1]
+    assert places.Local(tmp_path, places.slots()).has_gpus
 
 
 def test_trainings_run_only_on_the_gpus_that_the_sweep_may_use(tmp_path, monkeypatch):
@@ -106,17 +109,20 @@ def test_trainings_run_only_on_the_gpus_that_the_sweep_may_use(tmp_path, monkeyp
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2, GPU-8f1c")
     used = [places.environment(tmp_path, slot)["CUDA_VISIBLE_DEVICES"] for slot in places.slots()]
     assert used == ["2", "GPU-8f1c"]
-    assert places.slots(1) == ["gpu2"]
+    assert places.slots(1) == [("-", {"CUDA_VISIBLE_DEVICES": "2"})]
 
 
 def test_a_training_has_one_thread_on_a_core_and_one_gpu_on_a_gpu(tmp_path, monkeypatch):
     for name in ("NPROC", "JAX_COMPILATION_CACHE_DIR"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5")
-    assert places.environment(tmp_path, "0")["NPROC"] == "1"
-    assert "NPROC" not in places.environment(tmp_path, "-")
-    on_gpu = places.environment(tmp_path, "gpu3")
-    assert on_gpu["CUDA_VISIBLE_DEVICES"] == "3"
+    monkeypatch.setattr(places, "_gpus", lambda: 0)
+    assert {places.environment(tmp_path, slot)["NPROC"] for slot in (*places.slots(), *places.slots(999))} == {"1"}
+    assert "NPROC" not in places.environment(tmp_path, places.Slot())
+    monkeypatch.setattr(places, "_gpus", lambda: 1)
+    on_gpu = places.environment(tmp_path, *places.slots())
+    assert on_gpu["CUDA_VISIBLE_DEVICES"] == "5"
+    assert "NPROC" not in on_gpu
     assert pathlib.Path(on_gpu["JAX_COMPILATION_CACHE_DIR"]).is_relative_to(tmp_path)
 
 

@@ -72,6 +72,12 @@ def test_everything_is_done_as_many_at_a_time_as_there_is_room(tmp_path):
     assert Pretence.started[:2] == ["vrm-pendulum-seed0", "vrm-cartpole-seed0"]
 
 
+def test_on_gpus_all_seeds_of_an_experiment_share_a_program(tmp_path, monkeypatch):
+    monkeypatch.setattr(Pretence, "has_gpus", True)
+    sweep(TWO, tmp_path)
+    assert Pretence.started == ["vrm-pendulum-seed0to1", "vrm-cartpole-seed0to1"]
+
+
 def test_what_is_finished_is_not_done_again(tmp_path):
     sweep(TWO, tmp_path)
     Pretence.started.clear()

@@ -165,17 +165,17 @@ def test_a_search_goes_on_with_the_trials_that_are_missing(search):
 
 
 def test_a_stopped_trial_continues_with_its_settings(search, monkeypatch):
-    loop = tuning._Loop.step
+    loop = tuning._Trials.step
 
     def interrupted(self):
         loop(self)
         if len(Fake.started) == 2:
             os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr(tuning._Loop, "step", interrupted)
+    monkeypatch.setattr(tuning._Trials, "step", interrupted)
     with pytest.raises(Stopped, match="stopped with 1 of 3 trials done in"):
         search(3)
-    monkeypatch.setattr(tuning._Loop, "step", loop)
+    monkeypatch.setattr(tuning._Trials, "step", loop)
     tuned = search(3)
     assert [training.name for training in Fake.started] == ["trial-000", "trial-001", "trial-001", "trial-002"]
     assert Fake.started[1].settings == Fake.started[2].settings
@@ -199,7 +199,7 @@ def test_a_trial_that_is_stopped_from_outside_continues_at_once(search, monkeypa
 
 
 def test_trials_that_finish_while_they_are_stopped_count_as_done(search, monkeypatch):
-    loop = tuning._Loop.step
+    loop = tuning._Trials.step
 
     def interrupted(self):
         loop(self)
@@ -210,7 +210,7 @@ def test_trials_that_finish_while_they_are_stopped_count_as_done(search, monkeyp
             while self.evaluate(training) < training.steps - EVERY:
                 pass
 
-    monkeypatch.setattr(tuning._Loop, "step", interrupted)
+    monkeypatch.setattr(tuning._Trials, "step", interrupted)
     monkeypatch.setattr(Fake, "stop", finish_all)
     with pytest.raises(Stopped, match="stopped with 2 of 3 trials done in"):
         search(3, workers=2)
@@ -291,14 +291,14 @@ def test_a_finished_search_says_so(search, tmp_path, capsys):
 
 def test_a_trial_that_still_ends_is_waited_for(search, tmp_path, monkeypatch):
     """After a kill of the search its trainings take a while to write their checkpoints."""
-    loop = tuning._Loop.step
+    loop = tuning._Trials.step
 
     def killed(self):
         loop(self)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(tuning._Loop, "step", killed)
+        patched.setattr(tuning._Trials, "step", killed)
         with pytest.raises(KeyboardInterrupt):
             search(3)
     assert [training.name for training in Fake.started] == ["trial-000"]
@@ -309,21 +309,21 @@ def test_a_trial_that_still_ends_is_waited_for(search, tmp_path, monkeypatch):
         if len(self.status.finished) == 2:
             there.close()
 
-    monkeypatch.setattr(tuning._Loop, "step", step)
+    monkeypatch.setattr(tuning._Trials, "step", step)
     tuned = search(3)
     assert [training.name for training in Fake.started[1:]] == ["trial-001", "trial-002", "trial-000"]
     assert [trial.state for trial in tuned.trials] == ["complete"] * 3
 
 
 def test_a_trial_that_is_stopped_with_the_search_continues_whatever_its_exit_code(search, monkeypatch):
-    loop, ended = tuning._Loop.step, Fake.ended
+    loop, ended = tuning._Trials.step, Fake.ended
 
     def interrupted(self):
         loop(self)
         os.kill(os.getpid(), signal.SIGINT)
 
     with monkeypatch.context() as patched:
-        patched.setattr(tuning._Loop, "step", interrupted)
+        patched.setattr(tuning._Trials, "step", interrupted)
         patched.setattr(Fake, "ended", lambda self: {name: code and 1 for name, code in ended(self).items()})
         with pytest.raises(Stopped):
             search(1)
@@ -333,14 +333,14 @@ def test_a_trial_that_is_stopped_with_the_search_continues_whatever_its_exit_cod
 def test_each_log_is_read_once_in_a_look(search, monkeypatch):
     read, lines = [], records.lines
     monkeypatch.setattr(records, "lines", lambda log: (read.append(log), lines(log))[1])
-    watch = tuning._Loop._watch
+    watch = tuning._Trials._watch
 
     def once(self, name):
         read.clear()
         watch(self, name)
         assert len(read) == len(set(read)) == 2  # two seeds
 
-    monkeypatch.setattr(tuning._Loop, "_watch", once)
+    monkeypatch.setattr(tuning._Trials, "_watch", once)
     search(1)
 
 
@@ -436,8 +436,12 @@ def test_an_agent_of_ones_own_has_ranges_or_gets_them():
         ranges.chosen(Own(), "m:Own", {}, fixed=["rate"])
 
 
-def test_the_command_gives_everything_to_the_search(monkeypatch, capsys, tmp_path):
+@pytest.mark.parametrize("pictures", [["history.png"], ["history.png", "importance.png"]])
+def test_the_command_gives_everything_to_the_search(monkeypatch, capsys, tmp_path, pictures):
     asked = {}
+    (tmp_path / "my search").mkdir()
+    for name in pictures:
+        (tmp_path / "my search" / name).touch()
 
     def search(**given):
         asked.update(given)
@@ -473,6 +477,7 @@ def test_the_command_gives_everything_to_the_search(monkeypatch, capsys, tmp_pat
     out = capsys.readouterr().out
     assert "2 trials, 1 complete, 1 failed" in out
     assert "1 failed: it broke" in out
+    assert f"my search has {' and '.join(pictures)}; `beliefrl report" in out
     assert f"`beliefrl report '{tmp_path / 'my search'}' --unfinished`" in out
     assert "tau=0.1" in out
     assert out.endswith("beliefrl train vrm pendulum-v\n")

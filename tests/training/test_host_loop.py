@@ -5,6 +5,7 @@ import os
 import re
 import signal
 import sys
+from functools import partial
 
 import gymnasium
 import jax
@@ -69,7 +70,7 @@ def test_no_step_copies_the_replay():
     """A copy takes longer than the updates if the replay is large."""
     agent = agents.make("sac-mlp", **SMALL["sac-mlp"])
     task = GymnasiumTask(lambda: Wrapped(Hanging()), max_steps=200)
-    program = host_loop.program(agent, task, CAPACITY, 1, [0], "never")
+    program = host_loop.program(agent, task, CAPACITY, 1, [0], partial(Lockstep, task))
     seeds = program.begin(jax.random.split(jax.random.key(0), 1))
     program.explore(seeds, 0, 0)
     program.learn(seeds, 0, 0)
@@ -95,7 +96,7 @@ def test_the_host_loop_learns_what_the_compiled_loop_learns(name, envs):
     stretches = {"learn": (10 * envs, 20 * envs), "cycle": rounds.round_length(agent, envs)}
     there, log = trained(phases.compile_program(agent, task, 100, 2, envs), keys, **stretches)
     wrapped = GymnasiumTask(Wrapped, "wrapped", {"task": task})
-    program = host_loop.program(agent, wrapped, 100, 2, range(2), "never", envs=envs)
+    program = host_loop.program(agent, wrapped, 100, 2, range(2), partial(Lockstep, wrapped), envs=envs)
     here, log_here = trained(program, keys, **stretches)
     program.close()
     theirs = there._replace(actor=there.actor._replace(task_state=()))
@@ -111,7 +112,7 @@ def test_the_host_loop_learns_what_the_compiled_loop_learns(name, envs):
 def test_every_window_is_unbroken_in_time():
     task = Counting()
     wrapped = GymnasiumTask(Wrapped, "counting", {"task": task}, measures=("success",))
-    program = host_loop.program(CountingAgent(), wrapped, 60, 3, range(2), "never")
+    program = host_loop.program(CountingAgent(), wrapped, 60, 3, range(2), partial(Lockstep, wrapped))
     seeds = program.begin(jax.random.split(jax.random.key(0), 2))
     seeds, log = program.explore(seeds, 0, 10)
     assert log.episodes.done.sum() == 2  # of seven steps each
@@ -131,7 +132,7 @@ def test_every_window_is_unbroken_in_time():
 @pytest.mark.parametrize(("ends", "limit", "where"), [(4, 1000, [4, 9]), (1000, 4, []), (4, 4, [4, 9])])
 def test_a_stored_timestep_is_terminal_where_the_task_ended_and_not_at_the_limit(ends, limit, where):
     task = GymnasiumTask(Wrapped, "counting", {"task": Counting(ends, limit)}, measures=("success",))
-    program = host_loop.program(CountingAgent(), task, 60, 1, [0], "never")
+    program = host_loop.program(CountingAgent(), task, 60, 1, [0], partial(Lockstep, task))
     seeds, _ = program.explore(program.begin(jax.random.split(jax.random.key(0), 1)), 0, 10)
     program.close()
     step = jax.tree.map(lambda leaf: leaf[0, : int(seeds.replay.added[0])], seeds.replay.timesteps.step)
@@ -150,7 +151,7 @@ class Perceiving(CountingAgent):
 def test_evaluated_episodes_begin_without_reward_and_action():
     """The return is minus the first action."""
     task = GymnasiumTask(Wrapped, "alternating", {"task": Alternating(max_steps=3)}, measures=("success",))
-    program = host_loop.program(Perceiving(), task, 60, 3, [0], "never")
+    program = host_loop.program(Perceiving(), task, 60, 3, [0], partial(Lockstep, task))
     result = program.evaluate(CountingState(jnp.zeros(1), jnp.zeros(1)), jax.random.split(jax.random.key(0), 1))
     program.close()
     np.testing.assert_array_equal(result.episode_return, np.full((1, 2, 3), -0.25))
@@ -322,7 +323,7 @@ def test_what_was_learned_before_a_fault_is_kept(tmp_path):
         assert [row["step"] for row in run.rows(seed, "evaluation")] == [20]
         assert [row["length"] for row in run.rows(seed, "episode")] == [10, 10]
         assert [row["step"] for row in run.rows(seed, "update")][-1] == 26  # as far as it came
-    _, origin = initial.taken(Options(init_from=str(run.folder), seed=5), agent, GymnasiumTask(Fine).spec)
+    _, origin = initial.taken(run, Options(seed=5), agent, GymnasiumTask(Fine).spec)
     assert origin["seeds"][5] == {"seed": 5, "step": 26}
     action, _ = load(run, task=Fine).predict(np.zeros(2))
     with pytest.raises(UserError, match="on all entries of the observation, and the given task shows entries 1 0"):

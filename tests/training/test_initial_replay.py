@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from beliefrl import UserError, resume, tasks, train
+from beliefrl import Run, UserError, resume, tasks, train
 from beliefrl.runs import arrays
 from beliefrl.runs.checkpoint import Checkpoints, listed
 from beliefrl.runs.options import Options
@@ -49,7 +49,7 @@ def written(folder, capacity, added, first=None):
 
 
 def taken(run, seeds=(0, 1), **options):
-    return initial_replay.taken(Options(init_from=str(run.folder), **options), AGENT, TASK, list(seeds))
+    return initial_replay.taken(run, Options(**options), AGENT, TASK, list(seeds))
 
 
 def test_each_seed_has_the_timesteps_of_its_own_ring_in_order(source):
@@ -105,13 +105,12 @@ def test_timesteps_of_another_task_are_one_sentence_and_no_folder(source, tmp_pa
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("memory", ["reward_memory", "observation_memory"])
-def test_other_notes_are_one_sentence(tmp_path, memory):
-    for now in ((16.0,), ()):
-        old, new = (tiny("predictive-sac", **{memory: constants}) for constants in ((8.0,), now))
-        run = saved(tmp_path / str(len(now)), "predictive-sac", TASK, agent=old)
-        with pytest.raises(UserError, match=rf"{memory}=\[8.0\], and"):
-            initial_replay.taken(Options(init_from=str(run.folder)), new, TASK, [0])
+@pytest.mark.parametrize("name", ["store_state", "store_first_impression"])
+def test_other_notes_are_one_sentence(tmp_path, name):
+    old, new = (tiny("vrm", **{name: stores}) for stores in (True, False))
+    run = saved(tmp_path / "run", "vrm", TASK, agent=old)
+    with pytest.raises(UserError, match=rf"{name}=True, and this training has False"):
+        initial_replay.taken(run, Options(), new, TASK, [0])
 
 
 def test_the_replay_of_a_diverged_seed_is_not_taken(tmp_path):
@@ -177,4 +176,4 @@ def test_actions_with_other_bounds_are_one_sentence(tmp_path):
     config["interface"] = GymnasiumTask(Fine).interface._asdict()
     (run.folder / "config.json").write_text(json.dumps(config))
     with pytest.raises(UserError, match=r"another environment: lower bounds of the actions before: \[-2.0\]"):
-        initial_replay.taken(Options(init_from=str(run.folder)), AGENT, task, [0])
+        initial_replay.taken(Run(run.folder), Options(), AGENT, task, [0])

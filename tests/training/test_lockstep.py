@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -43,7 +44,7 @@ def test_every_environment_is_recorded_with_its_own_episodes(task, hosted):
     agent = CountingAgent()
     if hosted:
         wrapped = GymnasiumTask(Wrapped, "counting", {"task": task}, measures=("success",))
-        program = host_loop.program(agent, wrapped, 90, 2, range(2), "never", envs=ENVS)
+        program = host_loop.program(agent, wrapped, 90, 2, range(2), partial(Lockstep, wrapped), envs=ENVS)
     else:
         program = phases.compile_program(agent, task, 90, 2, ENVS)
     length = min(task.max_steps, task.ends)
@@ -70,7 +71,7 @@ def test_readers_go_on_through_pretraining_and_every_cycle(envs, hosted):
     agent, task = ReadingAgent(), Counting(max_steps=20)
     if hosted:
         wrapped = GymnasiumTask(Wrapped, "counting", {"task": task}, measures=("success",))
-        program = host_loop.program(agent, wrapped, 90, 2, range(2), "never", envs=envs)
+        program = host_loop.program(agent, wrapped, 90, 2, range(2), partial(Lockstep, wrapped), envs=envs)
     else:
         program = phases.compile_program(agent, task, 90, 2, envs)
     seeds = program.begin(jax.random.split(jax.random.key(0), 2))

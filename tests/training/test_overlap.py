@@ -3,6 +3,7 @@
 import os
 import threading
 import time
+from functools import partial
 from typing import ClassVar
 
 import jax
@@ -15,6 +16,7 @@ from beliefrl.errors import Fault
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import host_loop
 from beliefrl.training.host_loop import HostLoop
+from beliefrl.training.lockstep import Lockstep
 from beliefrl.training.rounds import round_length
 from beliefrl.types import UserError
 from training.test_host_loop import Late, Wrapped
@@ -33,7 +35,7 @@ def small_agent():
 
 def overlapping(agent, environment, seeds=1, envs=1, measures=(), **settings):
     task = GymnasiumTask(environment, "overlapping", settings, measures=measures)
-    return host_loop.program(agent, task, 90, 2, range(seeds), "never", envs=envs, overlap=True)
+    return host_loop.program(agent, task, 90, 2, range(seeds), partial(Lockstep, task), envs=envs, overlap=True)
 
 
 class Telling(CountingAgent):

@@ -1,5 +1,7 @@
 """Evaluations in the environment of the training, because there is no other."""
 
+from functools import partial
+
 import jax
 import numpy as np
 import pytest
@@ -49,13 +51,14 @@ def free():
 
 def test_the_returns_are_those_of_other_environments():
     task, seeds = GymnasiumTask(Paying), [3, 4]
+    make = partial(Lockstep, task)
     keys = jax.random.split(jax.random.key(1), 2)
     states = jax.vmap(lambda key: AGENT.init(key, task.spec))(keys)
-    own = Evaluation(AGENT, task, seeds, "never")
+    own = Evaluation(AGENT, task, seeds, make)
     there = own.play(states, keys, 3)
     own.close()
-    lanes, counts = Lockstep(task, ["a", "b"]), []
-    here = Evaluation(AGENT, task, seeds, "never", shared=lanes).play(states, keys, 3, counts.append)
+    lanes, counts = make(["a", "b"]), []
+    here = Evaluation(AGENT, task, seeds, make, lanes).play(states, keys, 3, counts.append)
     lanes.close()
     assert there.episode_return.shape == here.episode_return.shape == (2, 2, 3)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), here, there)

@@ -1,5 +1,6 @@
 """A training from beginning to end, as a user starts it: what it leaves, says and survives, where it starts."""
 
+import dataclasses
 import json
 import os
 import pathlib
@@ -230,7 +231,7 @@ def source(tmp_path):
 
 
 def test_a_seed_starts_from_its_number_and_others_in_turn(source):
-    networks, origin = initial.taken(Options(init_from=str(source.folder), seed=3, seeds=4), AGENT, TASK.spec)
+    networks, origin = initial.taken(source, Options(seed=3, seeds=4), AGENT, TASK.spec)
     there = arrays.load(source.agents())
     for name, array in networks.items():
         np.testing.assert_array_equal(array, there[name][[1, 0, 1, 0]])
@@ -259,7 +260,7 @@ def test_other_layers_are_one_sentence_and_no_folder(tmp_path, recorded):
     assert config["hyperparameters"].pop("normalise_critics")
     config["hyperparameters"] |= recorded
     (source.folder / "config.json").write_text(json.dumps(config))
-    initial.taken(Options(init_from=str(source.folder)), tiny("predictive-sac", normalise_critics=False), TASK.spec)
+    initial.taken(Run(source.folder), Options(), tiny("predictive-sac", normalise_critics=False), TASK.spec)
     with pytest.raises(UserError, match=r"was trained with normalise_critics=False, not True"):
         train(tiny("predictive-sac"), TASK, source.folder, resume=True, **source.config["options"])
     with pytest.raises(UserError, match="normalise_critics=False, and this training has True; set normalise_critics=F"):
@@ -280,7 +281,7 @@ def test_a_run_from_before_an_option_is_not_continued_with_it(tmp_path, name, be
     config = json.loads((source.folder / "config.json").read_text())
     assert not config["hyperparameters"].pop(name)
     (source.folder / "config.json").write_text(json.dumps(config))
-    initial.taken(Options(init_from=str(source.folder)), old, TASK.spec)
+    initial.taken(Run(source.folder), Options(), old, TASK.spec)
     with pytest.raises(UserError, match=rf"was trained with {name}=\S+, not {now}"):
         train(tiny("predictive-sac"), TASK, source.folder, resume=True, **source.config["options"])
     with pytest.raises(UserError, match=as_initial):
@@ -306,6 +307,34 @@ def test_other_meanings_of_equal_arrays_are_one_sentence(tmp_path, name, setting
         train(tiny(name, **({other: True} if other else {})), TASK, tmp_path / "run", init_from=source)
 
 
+@dataclasses.dataclass(frozen=True)
+class Flipped(type(AGENT)):
+    """An agent of a user's whose settings have no arrays."""
+
+    flipped: bool = False
+    scales: tuple[float, ...] = ()
+    network_settings = ("flipped", "scales")
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "phrase"),
+    [
+        ({"flipped": True}, {}, "flipped=True, and this training has False; set flipped=True"),
+        ({}, {"scales": (1.0,)}, r"scales=\[\], and this training has \[1.0\]"),
+        ({"scales": (1.0,)}, {"scales": (2.0,)}, r"scales=\[1.0\], and this training has \[2.0\]"),
+    ],
+)
+def test_an_agent_of_ones_own_names_what_must_agree(tmp_path, before, now, phrase):
+    old, new = (Flipped(**{**vars(AGENT), **changes}) for changes in (before, now))
+    source = saved(tmp_path / "source", "mine:Flipped", TASK, agent=old)
+    for name in {"flipped", "scales"} - before.keys():  # a run from before a setting had its default
+        del source.config["hyperparameters"][name]
+    (source.folder / "config.json").write_text(json.dumps(source.config))
+    initial.taken(Run(source.folder), Options(), old, TASK.spec)
+    with pytest.raises(UserError, match=phrase):
+        initial.taken(Run(source.folder), Options(), new, TASK.spec)
+
+
 @pytest.mark.parametrize("envs", [1, 16])
 def test_agents_that_were_not_pretrained_are_refused(tmp_path, envs):
     agent = tiny("predictive-sac")
@@ -314,13 +343,13 @@ def test_agents_that_were_not_pretrained_are_refused(tmp_path, envs):
     (source.folder / "config.json").write_text(json.dumps(source.config))
     early = -(-agent.step_start_rl // envs) * envs
     late = early + 1
-    options = Options(init_from=str(source.folder), seed=4)
+    options = Options(seed=4)
     log = source.folder / "metrics" / "seed-4.jsonl"
     log.write_text(json.dumps({"kind": "evaluation", "step": early, "sampled": [-1.0], "mode": [-1.0]}) + "\n")
     with pytest.raises(UserError, match=rf"its agent was saved at step {early:,}, before the pre-training"):
-        initial.taken(options, agent, TASK.spec)
+        initial.taken(Run(source.folder), options, agent, TASK.spec)
     log.write_text(log.read_text().replace(f'"step": {early}', f'"step": {late}'))
-    initial.taken(options, agent, TASK.spec)
+    initial.taken(Run(source.folder), options, agent, TASK.spec)
 
 
 @pytest.mark.slow
@@ -362,7 +391,7 @@ def test_optimisers_start_anew(source):
 
 def test_an_agent_with_averaged_weights_starts_from_them(tmp_path):
     source, agent = saved(tmp_path / "source", "predictive-sac", TASK), tiny("predictive-sac")
-    networks, _ = initial.taken(Options(init_from=str(source.folder)), agent, TASK.spec)
+    networks, _ = initial.taken(source, Options(), agent, TASK.spec)
     initial.write(tmp_path, {initial.FILE: networks})
     states = jax.vmap(lambda key: agent.init(key, TASK.spec))(jax.random.split(jax.random.key(9), 1))
     started = agent.networks(initial.started_states(tmp_path, agent, states))

@@ -79,6 +79,16 @@ def values_before(agent: Any) -> dict[str, Any]:
     return plain(dict(getattr(agent, "values_before", {})))
 
 
+def named_by(agent: Any, attribute: Literal["network_settings", "note_settings"]) -> dict[str, Any]:
+    """The hyperparameters, as JSON, that a class attribute of an agent names; none if it has no such attribute.
+
+    network_settings: they change what the networks' arrays mean, but perhaps not their shapes. A training starts from
+    another run (init_from) only if they agree: tuples must be equal, and others must both be on, or both be off.
+    note_settings: with others, the notes in the replay differ. With init_replay they must be equal.
+    """
+    return plain({name: getattr(agent, name) for name in getattr(agent, attribute, ())})
+
+
 def restored(agent: Any, recorded: Mapping[str, Any]) -> Any:
     """An agent like this one, or of this class, with hyperparameters that were recorded as JSON.
 

@@ -33,6 +33,8 @@ from beliefrl.models.reading import Pool
 from beliefrl.models.scales import Scales, initial_scales, standardise, update_statistics
 from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range
 
+MEMORIES = ("reward_memory", "observation_memory")
+
 
 class State(NamedTuple):
     """Everything that training changes."""
@@ -140,6 +142,7 @@ class PredictiveSACAgent(ControllerAgent):
     }
     predictors = ("lstm",)
     losses = ("loss_q", "loss_actor", "loss_model")
+    network_settings = ("normalise_critics", "critic_likelihood", "perceive_reward", *MEMORIES)
     values_before = {
         "normalise_critics": False,
         "lr_model_min": 1.0,
@@ -160,7 +163,7 @@ class PredictiveSACAgent(ControllerAgent):
         fractions = "long_memories", "trace_decay", "off_policy_trace", "pessimism"
         check_range(self, ("lr_model", "lr_model_min", "jump", *fractions), 0, 1)
         check_range(self, ("average_rate",), 1e-6, 1)
-        memories = [name for name in ("reward_memory", "observation_memory") if getattr(self, name) != ()]
+        memories = [name for name in MEMORIES if getattr(self, name) != ()]
         check_range(self, ("longest_memory", *memories), 1)
 
     # How it is trained
@@ -173,9 +176,7 @@ class PredictiveSACAgent(ControllerAgent):
     def pretrain_windows(self) -> int:
         return self.sequences
 
-    @property
-    def cycle_windows(self) -> int:
-        return self.sequences
+    cycle_windows = pretrain_windows
 
     @property
     def perceived(self) -> Perceived:
@@ -240,8 +241,7 @@ class PredictiveSACAgent(ControllerAgent):
 
     def pretrain(self, state: State, windows: Window, key: Key[Array, ""]) -> tuple[State, Metrics]:
         state, _, metrics = self.learn_model(state, windows)
-        step = windows.step
-        usual = state.scales.usual.include(step.reward, windows.exists & ~step.is_first)
+        usual = state.scales.usual.include(windows.step.reward, windows.exists & ~windows.step.is_first)
         return state._replace(scales=state.scales._replace(usual=usual)), metrics
 
     def learn_model(self, state: State, windows: Window) -> tuple[State, Float[Array, "time batch belief"], Metrics]:

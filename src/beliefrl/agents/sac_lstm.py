@@ -64,6 +64,7 @@ class SACLSTMAgent(SACAgent):
         "perceive_action": (False, True),
         "perceive_reward": (False, True),
     }
+    network_settings = ("perceive_action", "perceive_reward")
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""

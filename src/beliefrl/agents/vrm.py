@@ -108,6 +108,8 @@ class VRMAgent(SACAgent):
         "batch_size": (4, 8, 16),
         "d_size": (64, 128, 256),
     }
+    network_settings = ("deterministic",)
+    note_settings = ("store_first_impression", "store_state")
 
     def __post_init__(self) -> None:
         """Refuse impossible values with a UserError."""

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from beliefrl.analysis.figures import figure, save
 from beliefrl.analysis.groups import Group
 from beliefrl.analysis.panels import add_legend, colours, counts, legend_height, tasks_of, with_curve
-from beliefrl.catalogue import unmasked, usual_constants
+from beliefrl.catalogue import split_mask, usual_constants
 from beliefrl.types import UserError
 
 Scores = Sequence[Float[np.ndarray, " seed"]]  # one array for each task
@@ -126,7 +126,7 @@ def known_bounds(task: str) -> tuple[float, float] | None:
     name, *changed = task.split()
     if (usual_constants(name) or {}).keys() & {word.partition("=")[0] for word in changed}:
         return None
-    return BOUNDS.get(unmasked(name))
+    return BOUNDS.get(split_mask(name)[0])
 
 
 def _normalised(returns: np.ndarray, ends: tuple[float, float]) -> np.ndarray:

@@ -114,8 +114,7 @@ def predict(argv: Sequence[str]) -> None:
     path = options.out or run.given / "predictions.png"
     png, _ = figures.paths(path)  # raises an error before the episode is played
     place = path.absolute()  # an environment may change the working directory
-    names = ("seed", "model", "start", "horizon", "samples", "episode_seed", "sampled", "best")
-    predicted = predictions(run, agent=own_agent(options.agent), **{name: getattr(options, name) for name in names})
+    predicted = predictions(run, **_without(options, "run", "out", "entries"))
     draw_predictions(predicted, place, options.entries or None)
     _written(png)
 
@@ -125,10 +124,7 @@ def video(argv: Sequence[str]) -> None:
     options = parse(VideoOptions, argv, "beliefrl video")
     from beliefrl.viewing import films
 
-    names = ("seed", "episode_seed", "sampled", "best", "episodes", "fps", "steps")
-    played = films.video(
-        options.run, options.out, agent=own_agent(options.agent), **{name: getattr(options, name) for name in names}
-    )
+    played = films.video(options.run, options.out, **_without(options, "run", "out"))
     _print_episodes(played, options.episode_seed)
     print(f"written to {options.out}")
 
@@ -138,10 +134,8 @@ def film(argv: Sequence[str]) -> None:
     options = parse(FilmOptions, argv, "beliefrl film")
     from beliefrl.viewing import films
 
-    names = ("frames", "start", "seed", "episode_seed", "sampled", "best", "steps")
-    given = {name: getattr(options, name) for name in names}
     out = options.out or (options.runs[0] / "film.png" if options.runs else None)
-    _written(films.film(options.runs, out, agent=own_agent(options.agent), **given))
+    _written(films.film(options.runs, out, **_without(options, "runs", "out")))
 
 
 def demo(argv: Sequence[str]) -> None:
@@ -165,6 +159,12 @@ def demo(argv: Sequence[str]) -> None:
         print(f"copied to {options.unpack}")
     if out is not None:
         print(f"written to {out}")
+
+
+def _without(options: Any, *names: str) -> dict[str, Any]:
+    """The options except these, as arguments of the function with the same names."""
+    given = {name: value for name, value in vars(options).items() if name not in names}
+    return given | {"agent": own_agent(options.agent)}
 
 
 def _has_screen() -> bool:

@@ -82,8 +82,7 @@ def _experiments(options: SweepOptions) -> list:
 
     check_range(options, ("scale",), 0, 1)
     for name in ("seeds", "steps", "workers", "seeds_per_run"):
-        if getattr(options, name) is not None:
-            check_whole(name, getattr(options, name), 1)
+        check_whole(name, getattr(options, name), 1, optional=True)
     first, count = options.seed or 0, options.seeds or (2 if options.scale < 1 else None)
     Options(seed=first, seeds=count or 1)
     if options.file is not None:

@@ -14,6 +14,7 @@ from beliefrl.commands.arguments import named_values, parse, value_lists
 from beliefrl.errors import UserError
 
 SHOWN = 5  # of the best trials
+PICTURES = ("history.png", "importance.png")  # the second needs two complete trials with different objectives
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,21 +70,21 @@ def tune(argv: Sequence[str]) -> None:
 
     from beliefrl.sweeps.tune import tune as search
 
-    same = ("agent", "task", "trials", "seeds", "seed", "only", "observe", "objective", "actions", "prune", "workers")
-    tuned = search(
-        ranges=_ranges(options.range),
-        settings=_settings(options),
-        constants=named_values(options.constants, "--constants"),
-        out=options.out,
-        **{name: getattr(options, name) for name in same},
-    )
+    changed: dict[str, Any] = {
+        "ranges": _ranges(options.range),
+        "settings": _settings(options),
+        "constants": named_values(options.constants, "--constants"),
+    }
+    same = {name: value for name, value in vars(options).items() if name not in ("range", "set", "steps")}
+    tuned = search(**same | changed)
     console = Console()
     console.print(_table(tuned))
     for why, count in Counter(trial.why for trial in tuned.trials if trial.state == "failed").items():
         print(f"{count} failed: {why or 'stopped before the training began'}")
     folder = tuned.study.parent
     shows = f"`beliefrl report {shlex.quote(str(folder))} --unfinished` shows the trials"
-    print(f"{folder} has history.png and importance.png; {shows}")
+    pictures = [name for name in PICTURES if (folder / name).exists()]
+    print(f"{folder} has {' and '.join(pictures)}; {shows}")
     print("this trains the best settings with new seeds:\n")
     print(tuned.command)  # one line, to be copied
 

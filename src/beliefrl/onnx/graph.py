@@ -1,7 +1,7 @@
 """A JAX function as an ONNX graph with a free batch size.
 
 The function is traced with a symbolic batch size. Values that depend only on constants are computed now and stored as
-numbers. Every other primitive becomes nodes of the graph. A `scan` is unrolled.
+numbers. Every other primitive becomes nodes of the graph. A `scan` is unrolled. CALLS are inlined, as in rounding.py.
 """
 
 import functools

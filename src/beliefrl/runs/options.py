@@ -81,10 +81,9 @@ class Options:
         check_range(self, ("seed",), 0, LAST_SEED)
         check_choice(self, "processes", get_args(Processes))
         check_choice(self, "precision", get_args(Precision))
-        check_choice(self, "init_best", (True, False))
-        check_choice(self, "init_replay", (True, False))
-        check_choice(self, "overlap", (True, False))
-        check_choice(self, "share_env", (True, False))
+        for field in dataclasses.fields(self):
+            if field.type is bool:
+                check_choice(self, field.name, (True, False))
         if self.share_env and self.envs > 1:
             raise UserError(f"share_env=True is impossible with envs={self.envs}: leave one of them out.")
         if self.stop_at is not None:

@@ -13,16 +13,25 @@ import socket
 import subprocess
 import sys
 import time
-from typing import IO, Any
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import IO, Any, NamedTuple
 
 from beliefrl.sweeps.plan import Training
 from beliefrl.sweeps.sources import PLAN
 from beliefrl.types import UserError
 
 RETRIES = 3  # restarts of a training whose machine is lost
-Slot = str  # a core's number, "gpu" and a GPU's name in CUDA_VISIBLE_DEVICES, "any" for any one core, or "-" for all
-
 BEGIN = "==== a training begins ====\n"  # separates sessions in a log
+GPU = "CUDA_VISIBLE_DEVICES"
+ONE_THREAD = {"NPROC": "1"}  # of XLA, even if the process cannot be bound to a core
+
+
+class Slot(NamedTuple):
+    """A place for one training at a time. By default it is the whole machine."""
+
+    core: str = "-"  # to which its process is bound; "-" is none
+    variables: Mapping[str, str] = MappingProxyType({})  # of its process's environment
 
 
 class Local:
@@ -31,6 +40,7 @@ class Local:
     def __init__(self, sweep: pathlib.Path, slots: list[Slot]):
         """`slots` are the places where trainings run, one training at a time in each."""
         self.sweep, self.free = sweep, list(slots)
+        self.has_gpus = any(GPU in slot.variables for slot in slots)
         self._running: dict[str, tuple[subprocess.Popen[bytes], Slot]] = {}
 
     @property
@@ -41,8 +51,7 @@ class Local:
     def start(self, training: Training) -> None:
         """Start a training in a free slot."""
         slot = self.free.pop(0)
-        core = slot if slot.isdigit() else "-"
-        command = worker(core, training.command(self.sweep))
+        command = worker(slot.core, training.command(self.sweep))
         with open_log(self.sweep / "logs" / f"{training.name}.log") as log:
             process = subprocess.Popen(
                 command,
@@ -87,16 +96,12 @@ def open_log(path: pathlib.Path) -> IO[bytes]:
 def environment(sweep: pathlib.Path, slot: Slot) -> dict[str, str]:
     """The environment variables of a training's process."""
     cache = sweep / "compiled" / platform.node()  # programs compiled here may not run on another machine
-    variables = {
+    return {
         "JAX_COMPILATION_CACHE_DIR": str(cache.absolute()),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.5",
         **os.environ,
+        **slot.variables,
     }
-    if slot.startswith("gpu"):
-        variables["CUDA_VISIBLE_DEVICES"] = slot.removeprefix("gpu")
-    elif slot != "-":
-        variables["NPROC"] = "1"  # one XLA thread, even if the process cannot be bound to a core
-    return variables
 
 
 def slots(workers: int | None = None) -> list[Slot]:
@@ -107,14 +112,15 @@ def slots(workers: int | None = None) -> list[Slot]:
     """
     gpus = _gpus()
     if gpus:
-        visible = os.environ.get("CUDA_VISIBLE_DEVICES")  # on a shared machine the other GPUs are not ours
+        visible = os.environ.get(GPU)  # on a shared machine the other GPUs are not ours
         names = visible.split(",") if visible else [str(index) for index in range(gpus)]
-        return [f"gpu{name.strip()}" for name in names[:gpus]][:workers]
+        return [Slot(variables={GPU: name.strip()}) for name in names[:gpus]][:workers]
+    any_core = Slot(variables=ONE_THREAD)
     if hasattr(os, "sched_getaffinity"):
-        cores = [str(core) for core in sorted(os.sched_getaffinity(0))]
+        cores = [Slot(str(core), ONE_THREAD) for core in sorted(os.sched_getaffinity(0))]
     else:
-        cores = ["any"] * (os.cpu_count() or 1)
-    return cores if workers in (None, len(cores)) else ["any"] * (workers or 0)
+        cores = [any_core] * (os.cpu_count() or 1)
+    return cores if workers in (None, len(cores)) else [any_core] * (workers or 0)
 
 
 def _gpus() -> int:
@@ -201,10 +207,10 @@ def train_on_node(sweep: str, log: str, command: list[str], on_gpu: bool) -> int
     """Run one training as a separate process on a machine of the cluster; returns its exit code."""
     if not (pathlib.Path(sweep) / PLAN).exists():
         raise FileNotFoundError(f"{socket.gethostname()} does not see {sweep}: the folder must be on all machines.")
-    slot = f"gpu{os.environ.get('CUDA_VISIBLE_DEVICES', '0')}" if on_gpu else "any"
+    slot = Slot(variables={GPU: os.environ.get(GPU, "0")} if on_gpu else ONE_THREAD)
     with open_log(pathlib.Path(log)) as out:
         process = subprocess.Popen(
-            worker("-", command),
+            worker(slot.core, command),
             env=environment(pathlib.Path(sweep), slot),
             stdin=subprocess.DEVNULL,
             stdout=out,

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from beliefrl import agents, tasks
-from beliefrl.catalogue import unmasked
+from beliefrl.catalogue import split_mask
 from beliefrl.runs.folder import folder_name
 from beliefrl.runs.options import NAMES as OPTIONS
 from beliefrl.runs.options import Options
@@ -24,10 +24,10 @@ from beliefrl.runs.run import Run
 from beliefrl.sweeps.experiments import Experiment
 from beliefrl.tasks.faults import Faults
 from beliefrl.training.schedule import capacity
-from beliefrl.types import UserError, plain
+from beliefrl.types import UserError, plain, tuples
 
 FAULTS = tuple(field.name for field in dataclasses.fields(Faults))
-SHRINKS = ("step_start_rl", "train_times_fivrm", "pretrain_updates")  # hyperparameters that count steps or updates
+SHRINKS = ("step_start_rl", "train_times_fivrm", "pretrain_updates")  # they count what comes before learning
 LONGEST_NAME = 120  # characters of a folder's name, without the seeds
 
 
@@ -148,7 +148,7 @@ GAIN_SIDE_BY_SIDE = ("sac-mlp",)
 
 def _seed_ranges(experiment: Experiment, seeds_per_run: int | None) -> list[tuple[int, int]]:
     """The experiment's seeds, split into runs of consecutive seeds: (first seed, number of seeds)."""
-    compiled = unmasked(experiment.task) in tasks.TASKS
+    compiled = split_mask(experiment.task)[0] in tasks.TASKS
     gains = compiled and experiment.agent in GAIN_SIDE_BY_SIDE
     most = seeds_per_run or (len(experiment.seeds) if gains else 1)
     ranges: list[tuple[int, int]] = []
@@ -227,9 +227,9 @@ def _typed(values: dict[str, Any], like: Any) -> dict[str, Any]:
     def typed(name: str, value: Any) -> Any:
         if isinstance(value, int) and not isinstance(value, bool) and isinstance(getattr(like, name, None), float):
             return float(value)
-        return tuple(value) if isinstance(value, list) else value
+        return value
 
-    return {name: typed(name, value) for name, value in values.items()}
+    return {name: typed(name, value) for name, value in tuples(values).items()}
 
 
 def _flag(name: str, value: Any) -> list[str]:

@@ -38,6 +38,8 @@ class Launcher(Protocol):
 
     @property
     def room(self) -> int: ...
+    @property
+    def has_gpus(self) -> bool: ...
     def start(self, training: Training) -> None: ...
     def ended(self) -> dict[str, int]: ...
     def stop(self) -> None: ...
@@ -74,8 +76,8 @@ def sweep(
     """
     if not isinstance(experiments, Sequence) or not all(isinstance(each, Experiment) for each in experiments):
         raise UserError("experiments must be a list of beliefrl.Experiment: beliefrl.grid makes one.")
-    check_whole("workers", 0 if workers is None else workers, 0)
-    check_whole("seeds_per_run", 1 if seeds_per_run is None else seeds_per_run, 1)
+    check_whole("workers", workers, 0, optional=True)
+    check_whole("seeds_per_run", seeds_per_run, 1, optional=True)
     if ray is not None and not isinstance(ray, str):
         raise UserError(f"ray={short(ray)} is impossible: give HOST:PORT of the head, or auto.")
     folder = as_path(out)
@@ -83,17 +85,18 @@ def sweep(
     with writing(folder), lock(folder):
         before = sources.read(folder)
         _check_named(folder, before, experiments)
-        slots = [] if ray else ["-"] if workers == 0 else places.slots(workers)
+        slots = [] if ray else [places.Slot()] if workers == 0 else places.slots(workers)
         launcher = places.Cluster(folder, ray, workers) if ray else places.Local(folder, slots)
         try:
-            on_gpu = launcher.has_gpus if isinstance(launcher, places.Cluster) else slots[0].startswith("gpu")
-            together = seeds_per_run or (ALL if on_gpu else None)
+            together = seeds_per_run or (ALL if launcher.has_gpus else None)
             trainings = plans.extended(before, experiments, together)
             _check_options(folder, trainings)
             sources.write(folder, trainings)
             status = _status(folder, trainings)
             with reporting(folder, report, progress) as listen, Requests(confirm) as requests:
-                _loop(folder, status, launcher, listen, requests)
+                of_sweep = folder, status, launcher
+                step, stop = functools.partial(_step, *of_sweep), functools.partial(_stop, *of_sweep)
+                loop(status, step, listen, requests, stop, LOOK_EVERY)
         finally:
             launcher.stop()  # also closes the connection to a Ray cluster
     if status.failed:
@@ -176,27 +179,47 @@ def _status(folder: pathlib.Path, trainings: Sequence[Training]) -> SweepStatus:
     return SweepStatus(finished, [training for training in trainings if training not in finished])
 
 
-def _loop(folder: pathlib.Path, status: SweepStatus, launcher: Launcher, report: Report, requests: Requests) -> None:
+def loop(
+    status: SweepStatus,
+    step: Callable[[], None],
+    report: Report,
+    requests: Requests,
+    stop: Callable[[], str],
+    every: float,
+) -> None:
+    """Call `step` and `report` every `every` seconds, until no training waits or runs.
+
+    At a signal, `stop` stops the trainings and returns the sentence of the Stopped that is raised.
+    """
     while True:
-        while launcher.room > 0 and (training := take(status, folder)):
-            launcher.start(training)
-            status.running[training.name] = training
-        for name, code in launcher.ended().items():
-            training = status.running.pop(name)
-            if code == 0:
-                status.finished.append(training)
-            else:
-                status.failed[name] = reason(folder / "logs" / f"{name}.log", code)
+        step()
         report(status)
         if requests.number:
-            launcher.stop()
-            finished = status.finished + [each for each in status.running.values() if each.is_finished(folder)]
-            done = f"{len(finished)} of {status.count}"  # some finish while they are asked to stop
-            go_on = f"`beliefrl sweep --out {shlex.quote(str(folder))}` continues."
-            raise Stopped(f"stopped with {done} trainings finished; {go_on}", requests.number)
+            raise Stopped(stop(), requests.number)
         if not (status.waiting or status.running):
             return
-        time.sleep(LOOK_EVERY)
+        time.sleep(every)
+
+
+def _step(folder: pathlib.Path, status: SweepStatus, launcher: Launcher) -> None:
+    """Start what there is room for, and collect what has ended."""
+    while launcher.room > 0 and (training := take(status, folder)):
+        launcher.start(training)
+        status.running[training.name] = training
+    for name, code in launcher.ended().items():
+        training = status.running.pop(name)
+        if code == 0:
+            status.finished.append(training)
+        else:
+            status.failed[name] = reason(folder / "logs" / f"{name}.log", code)
+
+
+def _stop(folder: pathlib.Path, status: SweepStatus, launcher: Launcher) -> str:
+    launcher.stop()
+    finished = status.finished + [each for each in status.running.values() if each.is_finished(folder)]
+    done = f"{len(finished)} of {status.count}"  # some finish while they are asked to stop
+    go_on = f"`beliefrl sweep --out {shlex.quote(str(folder))}` continues."
+    return f"stopped with {done} trainings finished; {go_on}"
 
 
 def reason(log: pathlib.Path, code: int) -> str:

@@ -13,7 +13,6 @@ import dataclasses
 import os
 import pathlib
 import shlex
-import time
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, get_args
 
@@ -26,9 +25,9 @@ from beliefrl.sweeps import places, ranges, study
 from beliefrl.sweeps.experiments import Experiment
 from beliefrl.sweeps.plan import Training
 from beliefrl.sweeps.progress import SweepStatus, take
-from beliefrl.sweeps.run import confirm, lock, reason, reporting, writing
+from beliefrl.sweeps.run import confirm, lock, loop, reason, reporting, writing
 from beliefrl.sweeps.study import Actions, Objective, Search, Trial
-from beliefrl.training.stop import Requests, Stopped
+from beliefrl.training.stop import Requests
 from beliefrl.types import UserError, check_whole, short
 
 LOOK_EVERY = 1.0  # seconds
@@ -120,20 +119,8 @@ def _run(folder: pathlib.Path, search: Search, trials: int, prune: bool, workers
         launcher = places.Local(folder, places.slots(workers))
         with reporting(folder, None, progress) as listen, Requests(confirm) as requests:
             try:
-                loop = _Loop(folder, recorded, search, launcher, status, stopped)
-                while True:
-                    loop.step()
-                    listen(status)
-                    if requests.number:
-                        launcher.stop()
-                        loop.collect(all_stopped=True)
-                        done = f"{len(status.finished) + len(status.pruned)} of {status.count}"
-                        raise Stopped(
-                            f"stopped with {done} trials done in {folder}; the same command continues.", requests.number
-                        )
-                    if not (status.waiting or status.running):
-                        break
-                    time.sleep(LOOK_EVERY)
+                begun = _Trials(folder, recorded, search, launcher, status, stopped)
+                loop(status, begun.step, listen, requests, begun.stop, LOOK_EVERY)
             finally:
                 launcher.stop()
         study.draw(recorded, folder)
@@ -142,7 +129,7 @@ def _run(folder: pathlib.Path, search: Search, trials: int, prune: bool, workers
 
 def _check(trials: int, seeds: int, seed: int, workers: int | None, objective: str, actions: str) -> None:
     check_whole("trials", trials, 1)
-    check_whole("workers", 1 if workers is None else workers, 1)
+    check_whole("workers", workers, 1, optional=True)
     Options(seeds=seeds, seed=seed)
     for name, value, known in (("objective", objective, Objective), ("actions", actions, Actions)):
         if value not in get_args(known):
@@ -196,7 +183,7 @@ def _result(folder: pathlib.Path, search: Search, begun: Sequence[Trial]) -> Tun
     )
 
 
-class _Loop:
+class _Trials:
     """Starts trials, reports their evaluations to Optuna, and records how they end."""
 
     def __init__(
@@ -292,6 +279,13 @@ class _Loop:
                 if self.failures >= PATIENCE:
                     logs = f"fix the cause; {self.folder}/logs has the output of each"
                     raise UserError(f"The last {self.failures} trials failed ({why.rstrip('.')}): {logs}.")
+
+    def stop(self) -> str:
+        """Stop all running trials; returns a sentence about it."""
+        self.launcher.stop()
+        self.collect(all_stopped=True)
+        done = f"{len(self.status.finished) + len(self.status.pruned)} of {self.status.count}"
+        return f"stopped with {done} trials done in {self.folder}; the same command continues."
 
     def _failed(self, name: str, trial: Any, why: str) -> None:
         trial.set_user_attr("why", why)

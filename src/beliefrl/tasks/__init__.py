@@ -8,7 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl import catalogue
-from beliefrl.catalogue import KNOWN, MASKS, PREFIX, ROBOTS, Known
+from beliefrl.catalogue import KNOWN, MASKS, PREFIX, ROBOTS, Known, split_mask
 from beliefrl.catalogue import TASK_GROUP as GROUP
 from beliefrl.catalogue import our_task_names as our_names
 from beliefrl.catalogue import task_names as names
@@ -63,7 +63,7 @@ def knows(name: str) -> bool:
 def _declared(name: str) -> tuple[str, str] | None:
     """The entry point, (name, module:Class), of a package's task with this name, or whose -v or -p version this is."""
     theirs = declared(GROUP, our_names())
-    for each in (name, name[:-2] if name[-2:] in MASKS else name):
+    for each in (name, split_mask(name)[0]):
         if each in theirs:
             return each, theirs[each]
     return None
@@ -134,7 +134,7 @@ def _make(name: str, constants: dict[str, Any]) -> Any:
         return registered.make(name.removeprefix(PREFIX), constants)
     if name not in our_names():
         return _make_declared(name, constants)
-    base, mask = (name[:-2], MASKS[name[-2:]]) if name[-2:] in MASKS else (name, None)
+    base, mask = split_mask(name)
     if base in ROBOTS:
         robot = ROBOTS[base]
         task = registered.make(robot.id, dict(robot.arguments) | constants, name)
@@ -152,7 +152,8 @@ def _make_declared(name: str, constants: dict[str, Any]) -> Any:
         raise UserError(f"There is no task {name!r}: {hint}")
     base, value = found
     task = _built(base, _declared_class(base, value), constants)
-    return task if name == base else observed(base, task, MASKS[name[-2:]])
+    _, mask = split_mask(name)
+    return task if mask is None or name == base else observed(base, task, mask)
 
 
 def _built(name: str, kind: type, constants: dict[str, Any]) -> Any:
@@ -226,7 +227,7 @@ def _describe_jax(variant: Variant) -> dict[str, Any]:
 
 
 def _describe_gymnasium(task: GymnasiumTask) -> dict[str, Any]:
-    base, mask = (task.name[:-2], MASKS[task.name[-2:]]) if task.name[-2:] in MASKS else (task.name, None)
+    base, mask = split_mask(task.name)
     robot = None if mask is None else ROBOTS.get(base)
     implied = robot is not None and task.indices == getattr(robot, str(mask))
     name = base if robot is not None and not implied else task.name  # the indices are of the full observation

@@ -58,9 +58,7 @@ def make(id: str, arguments: dict[str, Any], name: str | None = None) -> Gymnasi
         near = similar(id)
         hint = f"did you mean {near}?" if near else "an environment of another package is named gym:PACKAGE:ID."
         raise UserError(f"Gymnasium has no environment {id!r} ({_first_sentence(found)}): {hint}") from None
-    limit = arguments.get("max_episode_steps")
-    if limit is not None:
-        check_whole("max_episode_steps", limit, 1)
+    check_whole("max_episode_steps", arguments.get("max_episode_steps"), 1, optional=True)
     own = dict(arguments)
     measures = own.pop("measures", ())
     measures = (measures,) if isinstance(measures, str) else measures

@@ -3,6 +3,7 @@
 import contextlib
 import os
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -104,9 +105,10 @@ def _on_host(
     ended: Callable[[int], None],
     apart: bool,
 ) -> Episode:
-    how = ("always", None, run.options.step_timeout) if apart else ("never", None, None)
-    shared = Lockstep(task, [f"seed {seed}" for seed in run.seeds], *how) if run.options.share_env else None
-    evaluation = Evaluation(agent, task, run.seeds, *how, shared=shared)
+    how: dict[str, Any] = {"processes": "always", "timeout": run.options.step_timeout} if apart else {}
+    make = partial(Lockstep, task, **how)
+    shared = make([f"seed {seed}" for seed in run.seeds]) if run.options.share_env else None
+    evaluation = Evaluation(agent, task, run.seeds, make, shared)
     try:
         return evaluation.play(states, keys, episodes, ended)
     finally:

@@ -25,18 +25,15 @@ class Evaluation:
         agent: Agent,
         task: GymnasiumTask,
         seeds: Sequence[int],
-        processes: str,
-        notify: Callable[[str], None] | None = None,
-        timeout: float | None = None,
+        make: Callable[[Sequence[str]], Lockstep],
         shared: Lockstep | None = None,
     ):
-        """`processes`, `notify` and `timeout` are those of `Lockstep`.
+        """`shared` are the environments of the training, one for each seed.
 
-        `shared` are the environments of the training, one for each seed. If it is None, two for each seed are made at
-        the first evaluation, one for sampled and one for mode actions.
+        If it is None, `make` makes two for each seed at the first evaluation, one for sampled and one for mode actions.
+        It is called with their names.
         """
-        self.agent, self.task, self.seeds = agent, task, seeds
-        self._how = processes, notify, timeout
+        self.agent, self.task, self.seeds, self._make = agent, task, seeds, make
         self.environments, self.is_shared = shared, shared is not None
         lanes = jax.vmap(partial(_perceive, agent, task.spec), in_axes=(None, 0, 0, 0, 0, None))
         self._perceive = jax.jit(jax.vmap(lanes, in_axes=(0, 0, 0, 0, None, None)))
@@ -51,7 +48,7 @@ class Evaluation:
         """`episodes` episodes, one after the other; leaves (seed, 2, episodes). `ended` is called with their count."""
         if self.environments is None:
             lanes = [f"evaluation of seed {seed}" for seed in self.seeds for _ in range(2)]
-            self.environments = Lockstep(self.task, lanes, *self._how)
+            self.environments = self._make(lanes)
         keys, explore = jax.vmap(lambda key: jax.random.split(key, 2))(keys), np.array([True, False])
         play = partial(self._play, self.environments, states)
         if not self.is_shared:

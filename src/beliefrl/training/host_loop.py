@@ -47,23 +47,20 @@ def program(
     capacity: int,
     episodes: int,
     seeds: Sequence[int],
-    processes: str,
-    notify: Callable[[str], None] | None = None,
-    timeout: float | None = None,
+    make: Callable[[Sequence[str]], Lockstep],
     envs: int = 1,
     overlap: bool = False,
     share: bool = False,
 ) -> Program:
     """The phases of training, with `envs` environments for each of `seeds`.
 
-    `processes`, `notify` and `timeout` are those of `Lockstep`. With `overlap`, updates are made during steps. With
-    `share`, evaluations take place in the environments of the training.
+    `make` makes environments with these names. With `overlap`, updates are made during steps. With `share`,
+    evaluations take place in the environments of the training.
     """
     copies = [""] if envs == 1 else [f", environment {copy}" for copy in range(envs)]
     lanes = [f"seed {seed}{copy}" for seed in seeds for copy in copies]
-    loop = HostLoop(agent, task, capacity, Lockstep(task, lanes, processes, notify, timeout), envs, overlap)
-    shared = loop.environments if share else None
-    evaluation = Evaluation(agent, task, seeds, processes, notify, timeout, shared)
+    loop = HostLoop(agent, task, capacity, make(lanes), envs, overlap)
+    evaluation = Evaluation(agent, task, seeds, make, loop.environments if share else None)
 
     def evaluate(states: Any, keys: Key[Array, " seed"]) -> Episode:
         loop.is_interrupted = share

@@ -13,7 +13,7 @@ import numpy as np
 
 from beliefrl import agents
 from beliefrl.agents import Agent
-from beliefrl.agents.hyperparameters import values_before
+from beliefrl.agents.hyperparameters import named_by, values_before
 from beliefrl.runs import arrays, best
 from beliefrl.runs.options import Options
 from beliefrl.runs.records import sessions
@@ -23,35 +23,22 @@ from beliefrl.training.phases import SeedState
 from beliefrl.types import Spec, UserError, plain
 
 FILE = "initial.safetensors"
-MEANING = {
-    "normalise_critics": False,
-    "critic_likelihood": False,
-    "reward_memory": (),
-    "observation_memory": (),
-    "deterministic": False,
-    "perceive_action": False,
-    "perceive_reward": False,
-}
-"""Hyperparameters that change what the arrays mean, and their value in an agent without them. For those with False it
-matters only whether they are on."""
 
 
-def seeds_there(options: Options) -> list[int]:
+def seeds_there(source: Run, options: Options) -> list[int]:
     """The index of the seed in the other run, for each seed of this training."""
-    source = Run(options.init_from or "")
     return [(seed - source.seeds[0]) % len(source.seeds) for seed in range(options.seed, options.seed + options.seeds)]
 
 
-def taken(options: Options, agent: Agent, spec: Spec) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def taken(source: Run, options: Options, agent: Agent, spec: Spec) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The initial networks of all seeds by their names, and where they come from, for config.json.
 
-    Seed n starts from seed n of the other run. If the other run has fewer seeds, its seeds are reused in a cycle.
+    Seed n starts from seed n of the other run, `source`. If it has fewer seeds, its seeds are reused in a cycle.
 
     Raises:
-        UserError: there is no such run, it has no trained agent, its agent was not pre-trained, or the agents differ in
-            an array or in a setting of MEANING.
+        UserError: the other run has no trained agent, its agent was not pre-trained, or the agents differ in
+            an array or in one of `network_settings`.
     """
-    source = Run(options.init_from or "")
     path = source.agents(options.init_best)
     try:
         saved = _fitting(source, arrays.load(path), agent, spec)
@@ -60,7 +47,7 @@ def taken(options: Options, agent: Agent, spec: Spec) -> tuple[dict[str, np.ndar
             _refuse_other_settings(source, agent)  # a hyperparameter says more than the first array that differs
         raise
     _refuse_other_settings(source, agent)
-    seeds, index = range(options.seed, options.seed + options.seeds), seeds_there(options)
+    seeds, index = range(options.seed, options.seed + options.seeds), seeds_there(source, options)
     ends = best.evaluations(source.folder, len(source.seeds)) if options.init_best else _last_steps(source)
     _refuse_untrained(source, agent, [ends[at] for at in index])
     session = sessions(source.config)[-1]
@@ -132,19 +119,23 @@ def _refuse_untrained(source: Run, agent: Agent, ends: list[dict[str, Any] | Non
 
 
 def _refuse_other_settings(source: Run, agent: Agent) -> None:
-    """Refuse hyperparameters that change what the arrays mean, and that `_fitting` cannot see or names badly.
+    """Refuse other `network_settings`, which `_fitting` cannot see or names badly.
 
-    Layer normalisation has no arrays of its own, and memories with other time constants may have equal shapes. Runs
-    from before these hyperparameters have no entries.
+    Layer normalisation has no arrays of its own, and memories with other time constants may have equal shapes.
     """
     recorded = values_before(agent) | source.config["hyperparameters"]
-    for name, absent in MEANING.items():
-        here, there = plain(getattr(agent, name, absent)), plain(recorded.get(name, absent))
-        if bool(here) != bool(there) or (absent == () and here != there):
+    for name, here in named_by(agent, "network_settings").items():
+        there = plain(recorded.get(name, getattr(type(agent), name, here)))
+        if _meaning(here) != _meaning(there):
             raise UserError(
                 f"{source.shown} cannot be init_from: it was trained with {name}={there}, and this training "
                 f"has {here}; set {name}={there}."
             )
+
+
+def _meaning(value: Any) -> Any:
+    """A list, or whether something else is on. An empty list is off."""
+    return value if isinstance(value, list) and value else bool(value)
 
 
 def _fitting(source: Run, saved: dict[str, np.ndarray], agent: Agent, spec: Spec) -> dict[str, np.ndarray]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from beliefrl import tasks
 from beliefrl.agents import Agent
-from beliefrl.agents.hyperparameters import values_before
+from beliefrl.agents.hyperparameters import named_by, values_before
 from beliefrl.runs import arrays, segments
 from beliefrl.runs.checkpoint import stored_timesteps
 from beliefrl.runs.options import Options
@@ -26,25 +26,20 @@ from beliefrl.types import Spec, UserError, plain
 
 FILE = "initial-replay.safetensors"
 ADDED = "added"  # the number of timesteps of each ring, among the arrays of the file
-NOTED = (  # what the agents' notes on timesteps depend on
-    "reward_memory",
-    "observation_memory",
-    "store_state",
-    "store_first_impression",
-)
 
 
-def taken(options: Options, agent: Agent, task: Any, seeds: list[int]) -> tuple[dict[str, np.ndarray], dict[str, int]]:
+def taken(
+    source: Run, options: Options, agent: Agent, task: Any, seeds: list[int]
+) -> tuple[dict[str, np.ndarray], dict[str, int]]:
     """The timesteps of all rings by their names, and what config.json says of them.
 
     The arrays have the shape (seed, [env,] time, ...). A shorter ring is padded at its end. `seeds` has the index of
-    the seed in the other run, for each seed of this training.
+    the seed in the other run, `source`, for each seed of this training.
 
     Raises:
-        UserError: that run was trained on another task, with other bounds of the actions, other `envs` or other notes,
-            it has no undamaged checkpoint, or its timesteps are not finite.
+        UserError: the other run was trained on another task, with other bounds of the actions, other `envs` or other
+            notes, it has no undamaged checkpoint, or its timesteps are not finite.
     """
-    source = Run(options.init_from or "")
     _same(source, agent, task, options.envs)
     check_interface(source, task)
     step, files = stored_timesteps(source.folder)
@@ -90,8 +85,7 @@ def _same(source: Run, agent: Agent, task: Any, envs: int) -> None:
     there |= about_task(source.config) | {"envs": source.options.envs}
     here = about_task(tasks.describe(task)) | {"envs": envs}
     names = (*decisive(task), "observe", "envs")
-    noted = {name: getattr(agent, name) for name in NOTED if hasattr(agent, name)}
-    for name, value in ({name: here[name] for name in names} | noted).items():
+    for name, value in ({name: here[name] for name in names} | named_by(agent, "note_settings")).items():
         if plain(there.get(name, value)) != plain(value):
             raise UserError(
                 f"init_replay is impossible: {source.shown} was trained with {name}={there[name]}, and this training "

@@ -14,7 +14,7 @@ import numpy as np
 
 from beliefrl import agents, tasks
 from beliefrl.agents import Agent, hyperparameters
-from beliefrl.catalogue import MASKS
+from beliefrl.catalogue import MASKS, split_mask
 from beliefrl.imports import path
 from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
@@ -179,10 +179,9 @@ def task_of(run: Run | str | os.PathLike[str], task: Task | GymnasiumTask | type
 
 def _entries(about: dict[str, Any]) -> str:
     """Which entries the agent sees, given `checks.about_task`."""
-    observed = about["observe"]
-    return (
-        MASKS.get(about["task"][-2:], "all entries") if observed is None else f"entries {' '.join(map(str, observed))}"
-    )
+    if about["observe"] is not None:
+        return f"entries {' '.join(map(str, about['observe']))}"
+    return split_mask(about["task"])[1] or "all entries"
 
 
 @contextlib.contextmanager

@@ -22,7 +22,8 @@ from jaxtyping import Array, BFloat16, Float, Float32
 
 NAME = "bfloat16"  # of this precision, in JAX
 SMALLEST = 16  # products with a side shorter than this are not faster in bfloat16, and stay in float32
-CALLS = ("jit", "pjit", "closed_call", "checkpoint", "remat2", "custom_jvp_call", "custom_vjp_call")  # run inline
+# Operations that are run inline. An ONNX graph inlines the same ones (onnx/graph.py).
+CALLS = ("jit", "pjit", "closed_call", "checkpoint", "remat2", "custom_jvp_call", "custom_vjp_call")
 LOOPS = ("scan", "while", "cond")  # operations that contain programs
 
 

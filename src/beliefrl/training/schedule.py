@@ -6,6 +6,7 @@ yields events, and `session` records them in a run's folder.
 
 import enum
 from collections.abc import Callable, Generator, Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -18,6 +19,7 @@ from beliefrl.runs.options import Options, Processes
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import host_loop, keys, phases
+from beliefrl.training.lockstep import Lockstep
 from beliefrl.training.phases import Program, SeedState
 from beliefrl.training.rollout import Episode
 from beliefrl.training.rounds import Metrics, round_length, stretch_length
@@ -111,8 +113,9 @@ def stages(
         if own_process:
             host_loop.keep_memory()
         processes = _processes(options, own_process)
-        how = options.step_timeout, options.envs, options.overlap, options.share_env
-        program = host_loop.program(agent, task, *sizes, numbers, processes, notify, *how)
+        make = partial(Lockstep, task, processes=processes, notify=notify, timeout=options.step_timeout)
+        how = options.envs, options.overlap, options.share_env
+        program = host_loop.program(agent, task, *sizes, numbers, make, *how)
     else:
         program = phases.compile_program(agent, task, *sizes, options.envs)
     of_seeds, at = jax.vmap(jax.random.key)(np.array(numbers)), TrainingProgress(refreshed=initial is not None)

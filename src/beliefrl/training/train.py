@@ -89,10 +89,12 @@ def train(
         return _go_on(run, changes, made, callback, own, own_process, progress)
     files = {}
     if chosen.init_from is not None:
-        files[initial.FILE], config["initial"] = initial.taken(chosen, agent, made.spec)
-    if chosen.init_replay:
-        files[initial_replay.FILE], about = initial_replay.taken(chosen, agent, made, initial.seeds_there(chosen))
-        config["initial"] |= about
+        source = Run(chosen.init_from)
+        files[initial.FILE], config["initial"] = initial.taken(source, chosen, agent, made.spec)
+        if chosen.init_replay:
+            seeds = initial.seeds_there(source, chosen)
+            files[initial_replay.FILE], about = initial_replay.taken(source, chosen, agent, made, seeds)
+            config["initial"] |= about
     recorder = Recorder(out or free_folder(f"{config['agent']}-{config['task']}"), config)
     with _reporting(recorder, callback, progress) as listen:
         return Session(recorder, agent, made, chosen, listen, own_process).run(files=files)

@@ -174,7 +174,7 @@ def play(
 def check_episode(episode_seed: int, steps: int | None = None) -> None:
     """Raise a UserError if one of the arguments is out of range."""
     check_whole("episode_seed", episode_seed, 0)
-    check_whole("steps", 1 if steps is None else steps, 1)
+    check_whole("steps", steps, 1, optional=True)
 
 
 def make_env(of: Run | str | os.PathLike[str] | Task | GymnasiumTask | type) -> gymnasium.Env[Any, Any]:

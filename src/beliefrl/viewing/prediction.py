@@ -136,7 +136,7 @@ def predictions(
 
 
 def _check_sizes(start: int | None, horizon: int, samples: int) -> None:
-    check_whole("start", 1 if start is None else start, 1)
+    check_whole("start", start, 1, optional=True)
     check_whole("horizon", horizon, 1)
     check_whole("samples", samples, 1, 10_000)
 
