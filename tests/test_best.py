@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from beliefrl import evaluate, load, play, tasks, video
+from beliefrl.errors import UserError
 from beliefrl.runs import arrays, best
 from beliefrl.runs.options import Options
 from beliefrl.training import initial
-from beliefrl.types import UserError
 from worlds import saved, tiny
 
 TASK = tasks.make("pendulum-p", max_steps=5)

@@ -17,7 +17,7 @@ import pytest
 import beliefrl
 from beliefrl import catalogue, tasks
 from beliefrl.cli import COMMANDS, main
-from beliefrl.types import UserError
+from beliefrl.errors import UserError
 
 ROOT = pathlib.Path(__file__).parent.parent
 DOCS = ROOT / "docs"

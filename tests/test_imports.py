@@ -11,7 +11,7 @@ import pytest
 import beliefrl
 from beliefrl import agents, catalogue, imports, tasks
 from beliefrl.commands import COMMANDS, find
-from beliefrl.types import UserError
+from beliefrl.errors import UserError
 from worlds import CountingAgent, installed
 
 

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from beliefrl import cli, onnx, tasks
+from beliefrl.errors import UserError
 from beliefrl.onnx.graph import model
 from beliefrl.policy import Policy, load
 from beliefrl.tasks.environment import TaskEnvironment
-from beliefrl.types import UserError
 from worlds import CountingAgent, begun, saved, tiny
 
 TASK = tasks.make("pendulum-p", max_steps=20)

@@ -11,12 +11,12 @@ import pytest
 
 import beliefrl
 from beliefrl import agents, tasks
+from beliefrl.errors import UserError
 from beliefrl.policy import Policy
 from beliefrl.runs.run import Run
 from beliefrl.tasks import make
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import rollout
-from beliefrl.types import UserError
 from worlds import TINY, begun, saved, tiny
 from wrong import Fine
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from beliefrl.agents import make as make_agent
     from beliefrl.agents.hyperparameters import Range
     from beliefrl.analysis.figures import draw_curve
+    from beliefrl.errors import UserError
     from beliefrl.policy import Policy, load
     from beliefrl.report import write_report
     from beliefrl.runs.options import Options
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
     from beliefrl.training.schedule import Event
     from beliefrl.training.stop import Stopped
     from beliefrl.training.train import resume, train
-    from beliefrl.types import Spec, StoredTimestep, Timestep, UserError, Window, WindowShape
+    from beliefrl.types import Spec, StoredTimestep, Timestep, Window, WindowShape
     from beliefrl.viewing.demo import demo
     from beliefrl.viewing.episodes import Trajectory, make_env, play
     from beliefrl.viewing.films import film, video
@@ -115,7 +116,7 @@ _HOMES = {
     "Timestep": "types:Timestep",
     "Trajectory": "viewing.episodes:Trajectory",
     "Tuned": "sweeps.tune:Tuned",
-    "UserError": "types:UserError",
+    "UserError": "errors:UserError",
     "Window": "types:Window",
     "WindowShape": "types:WindowShape",
     "check": "tasks.check:check",

@@ -22,6 +22,7 @@ from gymnasium.spaces import Box
 
 from beliefrl import agents, onnx
 from beliefrl.agents import Agent
+from beliefrl.errors import UserError
 from beliefrl.policy_inputs import check_finite, each, flags, numbers
 from beliefrl.runs.given_files import check_folder, write_given
 from beliefrl.runs.run import Run
@@ -31,7 +32,7 @@ from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.interface import Interface
 from beliefrl.tasks.spaces import scale
 from beliefrl.training.restore import check_interface, restore_policy, task_of
-from beliefrl.types import LARGEST, Spec, Timestep, UserError, check_whole
+from beliefrl.types import LARGEST, Spec, Timestep, check_whole
 
 State = tuple[np.ndarray, ...]
 

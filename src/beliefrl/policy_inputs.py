@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from beliefrl.types import UserError, as_array, short
+from beliefrl.errors import UserError, short
+from beliefrl.types import as_array
 
 
 def numbers(value: Any, name: str) -> np.ndarray:

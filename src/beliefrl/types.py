@@ -1,4 +1,4 @@
-"""Types for the whole library: a timestep, a window, a task's sizes, the error for a user's mistake (`UserError`).
+"""Types for the whole library: a timestep, a window, a task's sizes.
 
 Axis names in shapes, everywhere: `seed` (one training each), `batch` (windows), `time` (timesteps of a window),
 `obs`, `action`, `belief` (input of the controller), `d` (recurrent state), `z` (latent variable), `x` (perception).
@@ -16,11 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from beliefrl.errors import UserError as UserError
-from beliefrl.errors import cause as cause
-from beliefrl.errors import one_line as one_line
-from beliefrl.errors import said as said
-from beliefrl.errors import short as short
+from beliefrl.errors import UserError, short
 
 LARGEST = 2**31 - 1  # integer in a compiled program
 WIDEST = 100_000  # layer or state of a network

@@ -17,12 +17,13 @@ from beliefrl.agents import hyperparameters, named
 from beliefrl.agents.predictive_sac import PredictiveSACAgent
 from beliefrl.agents.sac_mlp import SACMLPAgent
 from beliefrl.agents.vrm import VRMAgent
+from beliefrl.errors import UserError
 from beliefrl.policy import Policy
 from beliefrl.tasks.environment import TaskEnvironment
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import host_loop, phases
 from beliefrl.training.lockstep import Lockstep
-from beliefrl.types import UserError, tuples
+from beliefrl.types import tuples
 from beliefrl.viewing.episodes import Player
 from worlds import Counting, CountingAgent, installed
 

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from beliefrl.agents.predictive_sac import Note, PredictiveSACAgent
+from beliefrl.errors import UserError
 from beliefrl.models import double_q, reading
 from beliefrl.models.double_q import Policy
 from beliefrl.models.predictive_model import init_model, prediction_loss, remember
 from beliefrl.models.scales import Usual, standardise
-from beliefrl.types import Reading, UserError
+from beliefrl.types import Reading
 from inputs import SPEC, changed_where_missing, same, windows
 
 AGENT = PredictiveSACAgent(

@@ -9,9 +9,9 @@ import pytest
 
 from beliefrl.agents.sac_lstm import SACLSTMAgent
 from beliefrl.agents.sac_mlp import SACMLPAgent
+from beliefrl.errors import UserError
 from beliefrl.models.nets import LSTM, LSTMState, draw, lstm_step
 from beliefrl.models.soft_actor_critic import actor_loss, q_loss, state_value, value_loss
-from beliefrl.types import UserError
 from inputs import SPEC, along, changed_where_missing, differ, random_like, slope, windows
 
 MLP = SACMLPAgent(policy_layers=(8, 8), value_layers=(8, 8), batch_size=6)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from beliefrl.agents.slac import SLACAgent, begin_windows
+from beliefrl.errors import UserError
 from beliefrl.models.latent_model import elbo_terms
-from beliefrl.types import UserError, perception
+from beliefrl.types import perception
 from inputs import SPEC, along, changed_where_missing, differ, random_like, same, slope, windows
 
 AGENT = SLACAgent(

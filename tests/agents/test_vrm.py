@@ -10,10 +10,11 @@ import pytest
 
 from beliefrl import agents
 from beliefrl.agents.vrm import VRMAgent
+from beliefrl.errors import UserError
 from beliefrl.models.scales import initial_statistics, standardise
 from beliefrl.models.variational_model import VRM
 from beliefrl.models.window_loss import draw_noise, model_loss, states
-from beliefrl.types import Timestep, UserError, Window, perception
+from beliefrl.types import Timestep, Window, perception
 from inputs import SMALL, SPEC, differ, same
 
 AGENT = VRMAgent(**SMALL)

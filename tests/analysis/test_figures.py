@@ -24,8 +24,8 @@ from beliefrl.analysis.tables import (
     write_final,
 )
 from beliefrl.cli import main
+from beliefrl.errors import UserError
 from beliefrl.sweeps import sources
-from beliefrl.types import UserError
 from inputs import HOUR, TWO_SEEDS, a_run, flat
 
 TWICE = {"steps_per_action": 2}

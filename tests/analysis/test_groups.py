@@ -19,9 +19,9 @@ from beliefrl.analysis.aggregate import (
 )
 from beliefrl.analysis.groups import find, groups, is_finished, last_step, left_out, task_label
 from beliefrl.analysis.results import cut
+from beliefrl.errors import UserError
 from beliefrl.runs.run import Run
 from beliefrl.tasks import describe, make
-from beliefrl.types import UserError
 from inputs import a_run, flat
 
 

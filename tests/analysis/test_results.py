@@ -10,8 +10,8 @@ import pytest
 from beliefrl import agents, cli
 from beliefrl.analysis import groups, results
 from beliefrl.analysis.panels import draw_elbo, model_loss
+from beliefrl.errors import UserError
 from beliefrl.report import write_report
-from beliefrl.types import UserError
 from inputs import HOUR, a_folder, a_run, flat
 
 KEPT = sorted((pathlib.Path(__file__).parents[2] / "results").glob("*.json.gz"))

@@ -11,9 +11,9 @@ from scipy.stats import t as student
 
 from beliefrl import catalogue
 from beliefrl.analysis.panels import AGENTS, colours
+from beliefrl.errors import UserError
 from beliefrl.report import data, write_report
 from beliefrl.report.data import statistics
-from beliefrl.types import UserError
 from inputs import EVIL, HOUR, TWO_SEEDS, a_folder
 
 

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from beliefrl.errors import UserError
 from beliefrl.runs import arrays, checkpoint
 from beliefrl.runs.checkpoint import Checkpoints, listed
-from beliefrl.types import UserError
 
 CAPACITY, SEEDS = 8, 2
 

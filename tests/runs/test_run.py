@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import beliefrl
+from beliefrl.errors import UserError
 from beliefrl.runs import best, records
 from beliefrl.runs.arrays import write_whole
 from beliefrl.runs.folder import folder_name, free_folder
@@ -26,7 +27,6 @@ from beliefrl.training.restore import as_argument
 from beliefrl.training.rollout import Episode
 from beliefrl.training.schedule import Event, Phase
 from beliefrl.training.summary import summary
-from beliefrl.types import UserError
 from inputs import a_run, flat
 
 CONFIG = {
@@ -214,7 +214,7 @@ from beliefrl.training.restore import agent_of
 from beliefrl.runs.run import Run
 from beliefrl.training.summary import summary
 from beliefrl.training.rollout import Episode
-from beliefrl.types import UserError
+from beliefrl.errors import UserError
 config = json.loads(pathlib.Path("config.json").read_text())
 for part, wrong in (
     ("options", {"seeds": "two", "seed": [2], "steps": None, "track": 5, "processes": {}, "eval_episodes": 1e4}),

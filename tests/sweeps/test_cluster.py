@@ -14,8 +14,8 @@ import time
 import pytest
 
 from beliefrl import sweep
+from beliefrl.errors import UserError
 from beliefrl.sweeps.experiments import grid
-from beliefrl.types import UserError
 
 pytest.importorskip("ray", reason="Ray is not installed: pip install 'beliefrl[sweep]'.")
 pytestmark = pytest.mark.slow

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from beliefrl import cli, sweep
+from beliefrl.errors import UserError
 from beliefrl.runs.run import Run
 from beliefrl.sweeps import places
 from beliefrl.sweeps import progress as module
@@ -21,7 +22,6 @@ from beliefrl.sweeps.plan import Training, plan
 from beliefrl.sweeps.progress import Forecast
 from beliefrl.sweeps.run import SweepStatus, reason
 from beliefrl.training.stop import Stopped
-from beliefrl.types import UserError
 from inputs import a_run
 
 QUICK = {

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from beliefrl import agents, cli, tasks
+from beliefrl.errors import UserError
 from beliefrl.runs.options import Options
 from beliefrl.runs.recorder import Recorder
 from beliefrl.sweeps import sources
 from beliefrl.sweeps.experiments import Experiment, grid
 from beliefrl.sweeps.plan import extended, plan, shrunk
 from beliefrl.sweeps.sources import load, read, write
-from beliefrl.types import UserError
 
 
 def test_a_grid_is_every_combination():

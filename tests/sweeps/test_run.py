@@ -7,12 +7,12 @@ import signal
 import pytest
 
 from beliefrl import cli, sweep
+from beliefrl.errors import UserError
 from beliefrl.runs.folder import locked
 from beliefrl.sweeps import run as runs
 from beliefrl.sweeps import sources
 from beliefrl.sweeps.experiments import Experiment, grid
 from beliefrl.training.stop import Stopped
-from beliefrl.types import UserError
 from inputs import Places
 
 TWO = grid(["vrm"], ["pendulum", "cartpole"], seeds=2, steps=10)

@@ -11,12 +11,12 @@ import sys
 import pytest
 
 from beliefrl import Range, agents, cli, tune
+from beliefrl.errors import UserError
 from beliefrl.runs import records
 from beliefrl.runs.folder import locked
 from beliefrl.sweeps import places, ranges, study
 from beliefrl.sweeps import tune as tuning
 from beliefrl.training.stop import Stopped
-from beliefrl.types import UserError
 from inputs import Places, a_folder
 
 EVERY = 1000

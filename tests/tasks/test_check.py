@@ -11,8 +11,9 @@ from gymnasium.wrappers import TimeAwareObservation, TimeLimit
 
 import beliefrl
 from beliefrl import cli, tasks
+from beliefrl.errors import UserError
 from beliefrl.tasks.gymnasium import GymnasiumTask
-from beliefrl.types import Spec, UserError
+from beliefrl.types import Spec
 from worlds import Counting
 from wrong import BOX, UNSUPPORTED, Dictionary, Endless, Fine, spaced, with_observation
 

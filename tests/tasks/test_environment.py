@@ -13,8 +13,8 @@ from gymnasium.utils.env_checker import check_env
 
 from beliefrl import tasks
 from beliefrl.catalogue import register, registered_ids
+from beliefrl.errors import UserError
 from beliefrl.tasks.environment import TaskEnvironment
-from beliefrl.types import UserError
 from worlds import Counting
 
 register()

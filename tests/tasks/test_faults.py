@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from beliefrl import TaskEnvironment, cli, evaluate, load, play, task_of, tasks, train
+from beliefrl.errors import UserError
 from beliefrl.runs.run import Run
 from beliefrl.tasks import make, observe, with_faults
 from beliefrl.tasks.faults import Faults
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.seen_environment import Environment
-from beliefrl.types import Spec, UserError
+from beliefrl.types import Spec
 from worlds import Counter, Counting, saved, tiny
 
 KEY = jax.random.key(3)

@@ -14,14 +14,13 @@ from gymnasium import spaces
 
 import beliefrl
 from beliefrl import catalogue, tasks
-from beliefrl.errors import Fault
+from beliefrl.errors import Fault, UserError
 from beliefrl.tasks import seen_environment
 from beliefrl.tasks.faults import Faults
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.interface import Interface
 from beliefrl.tasks.registered import _Registered
 from beliefrl.training.lockstep import Lockstep
-from beliefrl.types import UserError
 from wrong import BOX, FAULTS, UNSUPPORTED, Dictionary, Fine, observing, spaced, with_end
 
 

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from beliefrl import tasks
+from beliefrl.errors import UserError
 from beliefrl.tasks import TASKS, describe, entry_names, given, make, names, observe, with_action_repeat, with_faults
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.pendulum import Pendulum
 from beliefrl.tasks.target_reaching import TargetReaching
-from beliefrl.types import UserError, tuples
+from beliefrl.types import tuples
 from worlds import Counter, Counting, installed
 from wrong import Fine
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from beliefrl import GymnasiumTask, TaskEnvironment, cli, evaluate, play, task_of, train, with_action_repeat
+from beliefrl.errors import UserError
 from beliefrl.runs.run import Run
 from beliefrl.tasks import describe, entry_names, full, make, observe, steps_per_action, with_faults
 from beliefrl.tasks.faults import Faults
-from beliefrl.types import UserError
 from beliefrl.viewing.episodes import pace_of, playable
 from worlds import Counter, Counting, saved, tiny
 

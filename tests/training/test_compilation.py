@@ -15,9 +15,10 @@ import pytest
 from beliefrl import agents, catalogue, cli, evaluate, load, play, resume, tasks, train
 from beliefrl.agents.base import SACAgent
 from beliefrl.agents.vrm import VRMAgent
+from beliefrl.errors import UserError
 from beliefrl.training import compilation, phases
 from beliefrl.training.bench import Noise, _flop, bench, parameters
-from beliefrl.types import Spec, UserError
+from beliefrl.types import Spec
 from beliefrl.viewing.prediction import predictions
 from worlds import saved, tiny
 

@@ -15,14 +15,13 @@ import pytest
 from gymnasium import spaces
 
 from beliefrl import agents, cli, evaluate, load, resume, tasks, train
-from beliefrl.errors import Fault
+from beliefrl.errors import Fault, UserError
 from beliefrl.runs.options import Options
 from beliefrl.runs.run import Run
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.pendulum import Pendulum, PendulumState
 from beliefrl.training import host_loop, initial, lockstep, phases, rounds, session
 from beliefrl.training.lockstep import Lockstep
-from beliefrl.types import UserError
 from worlds import MODELS, SEQUENCES, SHARED, Alternating, Counting, CountingAgent, CountingState, leaves, trained
 from wrong import Closing, Fine, Killed, Raising
 

@@ -17,11 +17,12 @@ import pytest
 
 from beliefrl import UserError, agents, resume, tasks, train
 from beliefrl.errors import Fault
+from beliefrl.runs.options import Options
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import host_loop, lockstep, phases, rounds, schedule
 from beliefrl.training import replay as ring
 from beliefrl.training.lockstep import Lockstep
-from beliefrl.training.schedule import Options, _processes, stages
+from beliefrl.training.schedule import _processes, stages
 from beliefrl.types import StoredTimestep, Timestep, WindowShape, transitions
 from training.test_host_loop import Hanging, Wrapped
 from training.test_resume import AGENT, OPTIONS, Crash, crash_at, files

@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 
 from beliefrl import agents, resume, train
-from beliefrl.errors import Fault
+from beliefrl.errors import Fault, UserError
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import host_loop
 from beliefrl.training.host_loop import HostLoop
 from beliefrl.training.lockstep import Lockstep
 from beliefrl.training.rounds import round_length
-from beliefrl.types import UserError
 from training.test_host_loop import Late, Wrapped
 from worlds import SHARED, Counting, CountingAgent, ReadingAgent, leaves, trained
 from wrong import Fine

@@ -15,12 +15,13 @@ from beliefrl import cli
 from beliefrl.agents.vrm import VRMAgent
 from beliefrl.analysis.figures import curve_figure
 from beliefrl.analysis.tables import parameters
+from beliefrl.errors import UserError
 from beliefrl.models.nets import Gaussian
 from beliefrl.runs import arrays
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import phases
 from beliefrl.training.restore import agent_of
-from beliefrl.types import UserError, perception, plain
+from beliefrl.types import perception, plain
 from worlds import Counter, Counting, CountingAgent
 
 OPTIONS = {"steps": 20, "eval_every": 20, "eval_episodes": 1, "checkpoint_steps": 10}

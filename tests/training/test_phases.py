@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from beliefrl import agents, tasks
+from beliefrl.errors import UserError
 from beliefrl.runs.options import Options
 from beliefrl.training import phases, schedule
 from beliefrl.training.evaluation import evaluate
@@ -13,7 +14,6 @@ from beliefrl.training.log import without
 from beliefrl.training.rollout import Episode
 from beliefrl.training.schedule import Event, Phase
 from beliefrl.training.summary import MODES, summary
-from beliefrl.types import UserError
 from worlds import MODELS, SEQUENCES, SHARED, Alternating, Counting, CountingAgent, leaves, trained
 
 SMALL = {

@@ -16,6 +16,7 @@ from beliefrl import agents, evaluate, load, resume, train
 from beliefrl.analysis.figures import draw_curve
 from beliefrl.analysis.groups import groups, is_finished
 from beliefrl.cli import main
+from beliefrl.errors import UserError
 from beliefrl.runs.arrays import load as load_arrays
 from beliefrl.runs.arrays import packed
 from beliefrl.runs.best import evaluations
@@ -27,7 +28,6 @@ from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import session
 from beliefrl.training.schedule import Phase
 from beliefrl.training.stop import Stopped
-from beliefrl.types import UserError
 from worlds import Counting, CountingAgent, saved
 from wrong import Fine, Raising
 

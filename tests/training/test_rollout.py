@@ -10,10 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beliefrl import agents
+from beliefrl.errors import UserError
 from beliefrl.models import reading
 from beliefrl.training import replay as ring
 from beliefrl.training import rollout
-from beliefrl.types import StoredTimestep, Timestep, UserError, WindowShape, transitions
+from beliefrl.types import StoredTimestep, Timestep, WindowShape, transitions
 from worlds import Alternating, Counting, CountingAgent
 
 

@@ -10,10 +10,11 @@ import pytest
 
 from beliefrl import UserError, evaluate, tasks, train
 from beliefrl.errors import Fault
+from beliefrl.runs.options import Options
 from beliefrl.runs.run import Run
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.lockstep import Lockstep, step_seconds
-from beliefrl.training.schedule import Options, _processes
+from beliefrl.training.schedule import _processes
 from worlds import saved, tiny
 from wrong import Fine, OnlyHere, Single, Wide, WithChild
 

@@ -19,9 +19,9 @@ from beliefrl import play, tasks
 from beliefrl.cli import main
 from beliefrl.commands import pictures
 from beliefrl.commands.pictures import FilmOptions, PredictOptions, VideoOptions
+from beliefrl.errors import UserError
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.restore import restore_seed
-from beliefrl.types import UserError
 from beliefrl.viewing import demo, encoders, films, prediction
 from inputs import same
 from worlds import Counter, CountingAgent, saved

@@ -10,13 +10,14 @@ import beliefrl
 from beliefrl import tasks
 from beliefrl.agents.slac import SLACAgent
 from beliefrl.analysis import figures
+from beliefrl.errors import UserError
 from beliefrl.models import latent_model, variational_model
 from beliefrl.models.nets import Gaussian, draw
 from beliefrl.models.variational_model import VRM
 from beliefrl.policy import Policy
 from beliefrl.tasks.drawing import paint
 from beliefrl.tasks.gymnasium import GymnasiumTask
-from beliefrl.types import Timestep, UserError, perception
+from beliefrl.types import Timestep, perception
 from beliefrl.viewing import prediction
 from beliefrl.viewing.episodes import Player
 from worlds import Counter, Counting, CountingAgent, begun, saved, tiny

@@ -7,11 +7,11 @@ from typing import Any
 from beliefrl import catalogue
 from beliefrl.agents.hyperparameters import build, values_before
 from beliefrl.agents.protocol import Agent as Agent
-from beliefrl.agents.protocol import Metrics as Metrics
 from beliefrl.agents.protocol import Predictive as Predictive
 from beliefrl.catalogue import AGENT_GROUP as GROUP
+from beliefrl.errors import UserError, short
 from beliefrl.imports import declared, declared_name, is_named, load, load_declared, path
-from beliefrl.types import UserError, plain, short
+from beliefrl.types import plain
 
 # Every built-in name, and the agent with the hyperparameters that belong to this name.
 AGENTS: dict[str, Any] = {name: load(known.path)(**known.hyperparameters) for name, known in catalogue.AGENTS.items()}

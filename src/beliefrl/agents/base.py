@@ -13,12 +13,13 @@ from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents.hyperparameters import Range
 from beliefrl.agents.protocol import Metrics
+from beliefrl.errors import UserError
 from beliefrl.models.nets import tanh_gaussian
 from beliefrl.models.optimisation import Optimisers, OptimiserState, init_optimisers
 from beliefrl.models.returns import transition_batch
 from beliefrl.models.scales import RunningStatistics, standardise, update_statistics
 from beliefrl.models.soft_actor_critic import Batch, Controller, init_controller, loss, update
-from beliefrl.types import LARGEST, WIDEST, UserError, Window, WindowShape, check_choice, check_range, transitions
+from beliefrl.types import LARGEST, WIDEST, Window, WindowShape, check_choice, check_range, transitions
 
 MOST_STEPS = 64  # of an n-step return; each step is compiled
 

@@ -10,8 +10,9 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
+from beliefrl.errors import UserError, said
 from beliefrl.imports import path
-from beliefrl.types import UserError, plain, said, tuples
+from beliefrl.types import plain, tuples
 
 Scale = Literal["linear", "log", "horizon"]
 

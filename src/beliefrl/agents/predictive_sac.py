@@ -22,14 +22,14 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents.base import ControllerAgent, Range
+from beliefrl.agents.base import ControllerAgent
+from beliefrl.agents.hyperparameters import Range
 from beliefrl.agents.protocol import Metrics
 from beliefrl.models import double_q, predictive_model, reading
 from beliefrl.models.double_q import DoubleQController, Samples
 from beliefrl.models.nets import Gaussian, LSTMState
 from beliefrl.models.optimisation import Average, OptimiserState, descend, falling_rate, init_optimisers, valid_mean
 from beliefrl.models.predictive_model import Memory, Note, Perceived, PredictiveModel, perceive, prediction_loss
-from beliefrl.models.reading import Pool
 from beliefrl.models.scales import Scales, initial_scales, standardise, update_statistics
 from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_range
 
@@ -43,7 +43,7 @@ class State(NamedTuple):
     controller: DoubleQController
     scales: Scales
     readers: LSTMState  # the LSTM's state before each reader's next window, leaves (reader, d)
-    pool: Pool
+    pool: reading.Pool
     model_optimiser: optax.OptState
     controller_optimiser: OptimiserState
     average: Average  # of the model and the actor
@@ -201,7 +201,7 @@ class PredictiveSACAgent(ControllerAgent):
             controller,
             initial_scales(spec.obs_dim, belief, remembered),
             model.lstm.start(self.window.readers),
-            Pool.empty((self.pool, self.sequences * self.seq_len), belief, action),
+            reading.Pool.empty((self.pool, self.sequences * self.seq_len), belief, action),
             self.model_optimiser.init(model),  # pyright: ignore[reportArgumentType]
             init_optimisers(self.optimisers, controller.trained),
             Average.begin((model, controller.actor)),

@@ -17,7 +17,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents.base import Range, SACAgent, for_each_update
+from beliefrl.agents.base import SACAgent, for_each_update
+from beliefrl.agents.hyperparameters import Range
 from beliefrl.agents.protocol import Metrics
 from beliefrl.models.nets import LSTM, LSTMState, draw
 from beliefrl.models.optimisation import OptimiserState, descend, soft_update

@@ -18,7 +18,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents.base import Range, SACAgent, split_updates, split_windows
+from beliefrl.agents.base import SACAgent, split_updates, split_windows
+from beliefrl.agents.hyperparameters import Range
 from beliefrl.agents.protocol import Metrics
 from beliefrl.models.latent_model import LatentModel, Latents, elbo_terms, predict
 from beliefrl.models.nets import Gaussian, draw

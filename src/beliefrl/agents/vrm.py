@@ -23,15 +23,17 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from beliefrl.agents.base import Range, SACAgent, split_updates, split_windows, standardise_beliefs
+from beliefrl.agents.base import SACAgent, split_updates, split_windows, standardise_beliefs
+from beliefrl.agents.hyperparameters import Range
 from beliefrl.agents.protocol import Metrics
+from beliefrl.errors import UserError
 from beliefrl.models.nets import Gaussian, LSTMState, draw
 from beliefrl.models.optimisation import OptimiserState, descend
 from beliefrl.models.scales import RunningStatistics, initial_statistics, standardise
 from beliefrl.models.soft_actor_critic import Batch, Controller
 from beliefrl.models.variational_model import VRM, predict
 from beliefrl.models.window_loss import draw_noise, model_loss, states
-from beliefrl.types import WIDEST, Spec, Timestep, UserError, Window, WindowShape, check_choice, check_range, perception
+from beliefrl.types import WIDEST, Spec, Timestep, Window, WindowShape, check_choice, check_range, perception
 
 
 class Memory(NamedTuple):

@@ -17,7 +17,7 @@ from beliefrl.analysis.figures import figure, save
 from beliefrl.analysis.groups import Group
 from beliefrl.analysis.panels import add_legend, colours, counts, legend_height, tasks_of, with_curve
 from beliefrl.catalogue import split_mask, usual_constants
-from beliefrl.types import UserError
+from beliefrl.errors import UserError
 
 Scores = Sequence[Float[np.ndarray, " seed"]]  # one array for each task
 

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from beliefrl.analysis.groups import Group, task_label
+from beliefrl.errors import UserError
 from beliefrl.runs.given_files import check_folder, write_given
 from beliefrl.runs.run import Run
-from beliefrl.types import UserError
 
 COLOURS = {"sampled": "#1f6f8b", "mode": "#c8553d"}
 KINDS = (".png", ".pdf")

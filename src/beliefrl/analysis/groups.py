@@ -10,11 +10,11 @@ import numpy as np
 
 from beliefrl.analysis import results
 from beliefrl.catalogue import usual_constants
+from beliefrl.errors import UserError
 from beliefrl.runs.given_files import as_path
 from beliefrl.runs.options import Options
 from beliefrl.runs.records import finite_mean, steps_per_action
 from beliefrl.runs.run import Row, Run
-from beliefrl.types import UserError
 
 RunSeed = tuple[Run, int]  # a run and one of its seed numbers
 

@@ -16,7 +16,7 @@ import numpy as np
 from beliefrl.analysis.figures import axis_label, figure, save, standard_error
 from beliefrl.analysis.groups import Curve, Group, RunSeed
 from beliefrl.analysis.results import MODEL_LOSSES, means_between
-from beliefrl.types import UserError
+from beliefrl.errors import UserError
 
 COLUMNS = 3
 PANEL = (3.5, 2.7)  # inches

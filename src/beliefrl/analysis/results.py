@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
+from beliefrl.errors import UserError
 from beliefrl.runs.given_files import write_given
 from beliefrl.runs.run import Row, Run
-from beliefrl.types import UserError
 
 ENDING = ".json.gz"
 FORMAT = 1

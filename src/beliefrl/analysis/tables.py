@@ -15,11 +15,11 @@ from beliefrl.analysis.aggregate import known_bounds
 from beliefrl.analysis.figures import standard_error
 from beliefrl.analysis.groups import Curve, Group, last_step
 from beliefrl.analysis.panels import numbers
+from beliefrl.errors import UserError
 from beliefrl.runs import arrays
 from beliefrl.runs.given_files import check_folder, write_given
 from beliefrl.runs.records import sessions
 from beliefrl.runs.run import Run
-from beliefrl.types import UserError
 
 SOLVED = 0.95  # score (`aggregate`): a return of -203 on the pendulum, 951 on CartPole, 133 on target reaching
 TIMED_STEPS = 100_000  # as in the paper's table

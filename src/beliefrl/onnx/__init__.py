@@ -18,8 +18,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from beliefrl.errors import UserError, said
 from beliefrl.onnx.graph import model
-from beliefrl.types import UserError, said
 
 LARGEST_DIFFERENCE = 1e-5  # between a policy and its model
 CHECKED_STEPS = 200

@@ -14,7 +14,7 @@ import jax
 import jax.export
 import numpy as np
 
-from beliefrl.types import UserError
+from beliefrl.errors import UserError
 
 OPSET = 18  # understood by onnxruntime 1.14 and later
 BATCH = "batch"  # name of the free dimension

@@ -19,10 +19,10 @@ from string import Template
 from typing import Any
 
 from beliefrl.analysis.groups import find
+from beliefrl.errors import UserError
 from beliefrl.report.data import page_data
 from beliefrl.runs.cached import CachedRun
 from beliefrl.runs.given_files import as_path, check_folder, write_given
-from beliefrl.types import UserError
 
 
 def write_report(

@@ -16,7 +16,7 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from beliefrl.types import UserError, cause
+from beliefrl.errors import UserError, cause
 
 
 class Damaged(UserError):

@@ -25,10 +25,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from beliefrl.errors import UserError
 from beliefrl.runs import arrays, segments
 from beliefrl.runs.arrays import Damaged, sync_folder, write_whole
 from beliefrl.runs.segments import New, Segment
-from beliefrl.types import UserError
 
 FORMAT = 1
 NUMBER = "[0-9][0-9][0-9][0-9][0-9][0-9]"

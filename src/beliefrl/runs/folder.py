@@ -11,9 +11,10 @@ import shlex
 import shutil
 from typing import Any
 
+from beliefrl.errors import UserError, cause
 from beliefrl.runs import records
 from beliefrl.runs.arrays import write_whole
-from beliefrl.types import UserError, cause, plain
+from beliefrl.types import plain
 
 MAKING = r"metrics|lock|\.config\.json\.tmp"  # files that are made before config.json
 UNSAVED = (  # files of a training that has saved no agent and no checkpoint

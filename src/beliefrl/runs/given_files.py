@@ -4,8 +4,8 @@ import os
 import pathlib
 from typing import Any
 
+from beliefrl.errors import UserError, cause, short
 from beliefrl.runs.arrays import write_whole
-from beliefrl.types import UserError, cause, short
 
 
 def as_path(value: Any) -> pathlib.Path:

@@ -3,8 +3,9 @@
 import dataclasses
 from typing import Literal, get_args
 
+from beliefrl.errors import UserError
 from beliefrl.runs import trackers
-from beliefrl.types import LARGEST, LAST_SEED, UserError, check_choice, check_range
+from beliefrl.types import LARGEST, LAST_SEED, check_choice, check_range
 
 MOST_EPISODES = 100_000  # they run in parallel
 MOST_SECONDS = 1_000_000

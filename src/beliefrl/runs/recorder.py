@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from beliefrl.errors import UserError, cause
 from beliefrl.runs import arrays, records, trackers
 from beliefrl.runs.arrays import write_whole
 from beliefrl.runs.folder import locked, make, write_config
@@ -15,7 +16,6 @@ from beliefrl.runs.given_files import as_path
 from beliefrl.runs.records import Row, now
 from beliefrl.runs.run import Run
 from beliefrl.runs.trackers import Tracker
-from beliefrl.types import UserError, cause
 
 
 class Recorder(Run):

@@ -19,7 +19,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from beliefrl.types import LARGEST, UserError, cause
+from beliefrl.errors import UserError, cause
+from beliefrl.types import LARGEST
 
 PACKAGES = ("beliefrl", "jax", "jaxlib", "equinox", "optax", "numpy")
 SIMULATORS = ("gymnasium", "mujoco", "pybullet")  # recorded where they are used; returns depend on their versions

@@ -24,11 +24,12 @@ from collections.abc import Iterator
 from statistics import fmean
 from typing import Any
 
+from beliefrl.errors import UserError, one_line
 from beliefrl.runs import arrays, records
 from beliefrl.runs.best import BEST
 from beliefrl.runs.options import NAMES, Options
 from beliefrl.runs.records import Row
-from beliefrl.types import UserError, one_line, tuples
+from beliefrl.types import tuples
 
 
 class Run:

@@ -12,7 +12,7 @@ import time
 from collections.abc import Sequence
 from typing import Any, Protocol, runtime_checkable
 
-from beliefrl.types import UserError, said
+from beliefrl.errors import UserError, said
 
 
 @runtime_checkable

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from beliefrl.types import LAST_SEED, UserError, check_whole, plain, short
+from beliefrl.errors import UserError, short
+from beliefrl.types import LAST_SEED, check_whole, plain
 
 NAMED = Mapping, "a dictionary from names to values"
 KINDS = (

@@ -17,9 +17,9 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import IO, Any, NamedTuple
 
+from beliefrl.errors import UserError
 from beliefrl.sweeps.plan import Training
 from beliefrl.sweeps.sources import PLAN
-from beliefrl.types import UserError
 
 RETRIES = 3  # restarts of a training whose machine is lost
 BEGIN = "==== a training begins ====\n"  # separates sessions in a log

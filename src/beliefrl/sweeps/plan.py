@@ -17,6 +17,7 @@ from typing import Any
 
 from beliefrl import agents, tasks
 from beliefrl.catalogue import split_mask
+from beliefrl.errors import UserError
 from beliefrl.runs.folder import folder_name
 from beliefrl.runs.options import NAMES as OPTIONS
 from beliefrl.runs.options import Options
@@ -24,7 +25,7 @@ from beliefrl.runs.run import Run
 from beliefrl.sweeps.experiments import Experiment
 from beliefrl.tasks.faults import Faults
 from beliefrl.training.schedule import capacity
-from beliefrl.types import UserError, plain, tuples
+from beliefrl.types import plain, tuples
 
 FAULTS = tuple(field.name for field in dataclasses.fields(Faults))
 SHRINKS = ("step_start_rl", "train_times_fivrm", "pretrain_updates")  # they count what comes before learning

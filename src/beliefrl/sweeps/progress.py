@@ -12,11 +12,11 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from beliefrl.errors import UserError
 from beliefrl.runs.folder import is_locked
 from beliefrl.runs.run import Run
 from beliefrl.sweeps.plan import Training
 from beliefrl.training.screen import Screen, duration
-from beliefrl.types import UserError
 
 
 class Pace(NamedTuple):

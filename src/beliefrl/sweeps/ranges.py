@@ -7,7 +7,8 @@ from typing import Any, Protocol, get_args, runtime_checkable
 
 from beliefrl.agents import hyperparameters
 from beliefrl.agents.hyperparameters import Range, Ranges, Scale
-from beliefrl.types import UserError, tuples
+from beliefrl.errors import UserError
+from beliefrl.types import tuples
 
 DIGITS = 4  # significant digits of a drawn number, so that settings can be read and copied
 ENDS = re.compile(r"(?P<low>[^:]+)\.\.(?P<high>[^:]+?)(:(?P<scale>.*))?")

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 from beliefrl import agents
-from beliefrl.errors import OfCallback
+from beliefrl.errors import OfCallback, UserError, cause, one_line, short
 from beliefrl.runs.folder import locked
 from beliefrl.runs.given_files import as_path
 from beliefrl.runs.options import Options
@@ -25,7 +25,7 @@ from beliefrl.sweeps.plan import Training
 from beliefrl.sweeps.progress import SweepDisplay, SweepStatus, take
 from beliefrl.training.checks import CHANGEABLE
 from beliefrl.training.stop import Requests, Stopped
-from beliefrl.types import UserError, cause, check_whole, one_line, plain, short
+from beliefrl.types import check_whole, plain
 
 LOOK_EVERY = 0.5  # seconds
 OF_A_RUN = ("seed", "seeds")  # the plan divides the seeds into runs

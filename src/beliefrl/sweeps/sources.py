@@ -14,10 +14,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from beliefrl.errors import UserError, said
 from beliefrl.runs.arrays import write_whole
 from beliefrl.sweeps.experiments import Experiment, grid
 from beliefrl.sweeps.plan import OPTIONS, Training
-from beliefrl.types import UserError, plain, said
+from beliefrl.types import plain
 
 PLAN = "sweep.json"  # in the folder of a sweep
 FORMAT = 1

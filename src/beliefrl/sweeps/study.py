@@ -15,12 +15,13 @@ from typing import Any, Literal, NamedTuple
 
 from beliefrl.agents.hyperparameters import Ranges
 from beliefrl.analysis import figures
+from beliefrl.errors import UserError, short
 from beliefrl.runs.options import Options
 from beliefrl.runs.run import Run
 from beliefrl.sweeps import ranges
 from beliefrl.sweeps.experiments import Experiment
 from beliefrl.sweeps.plan import Training, agent_of, plan
-from beliefrl.types import UserError, plain, short
+from beliefrl.types import plain
 
 JOURNAL = "study.journal"
 RECORD = "search"  # the attribute of a study with `Search.record`

@@ -17,6 +17,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, get_args
 
 from beliefrl.agents.hyperparameters import Ranges
+from beliefrl.errors import UserError, short
 from beliefrl.runs.cached import CachedRun
 from beliefrl.runs.folder import folder_name
 from beliefrl.runs.given_files import as_path
@@ -28,7 +29,7 @@ from beliefrl.sweeps.progress import SweepStatus, take
 from beliefrl.sweeps.run import confirm, lock, loop, reason, reporting, writing
 from beliefrl.sweeps.study import Actions, Objective, Search, Trial
 from beliefrl.training.stop import Requests
-from beliefrl.types import UserError, check_whole, short
+from beliefrl.types import check_whole
 
 LOOK_EVERY = 1.0  # seconds
 PATIENCE = 3  # trainings that fail one after the other, after which tuning ends

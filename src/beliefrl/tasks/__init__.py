@@ -12,6 +12,7 @@ from beliefrl.catalogue import KNOWN, MASKS, PREFIX, ROBOTS, Known, split_mask
 from beliefrl.catalogue import TASK_GROUP as GROUP
 from beliefrl.catalogue import our_task_names as our_names
 from beliefrl.catalogue import task_names as names
+from beliefrl.errors import UserError, said, short
 from beliefrl.imports import declared, declared_name, load, load_declared, path
 from beliefrl.tasks import registered
 from beliefrl.tasks.faults import NONE, Faults
@@ -21,7 +22,7 @@ from beliefrl.tasks.variants import entries as entries
 from beliefrl.tasks.variants import entry_names as entry_names
 from beliefrl.tasks.variants import full as full
 from beliefrl.tasks.variants import steps_per_action as steps_per_action
-from beliefrl.types import Spec, UserError, said, short, tuples
+from beliefrl.types import Spec, tuples
 
 
 @runtime_checkable

@@ -13,13 +13,14 @@ from rich.table import Table
 from rich.text import Text
 
 from beliefrl import tasks
+from beliefrl.errors import UserError, short
 from beliefrl.tasks.check_warnings import Entry, about_episodes, about_observations, number
 from beliefrl.tasks.environment import TaskEnvironment
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.settings import settings_kept
 from beliefrl.tasks.spaces import action_names, check_actions, check_names, flat_bounds, flat_size, observation_names
 from beliefrl.tasks.traced import check_traced
-from beliefrl.types import LARGEST, UserError, check_whole, short
+from beliefrl.types import LARGEST, check_whole
 
 MOST_ROWS = 100  # of a printed table
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw
 
-from beliefrl.types import UserError, one_line
+from beliefrl.errors import UserError, one_line
 
 Point = Any  # (x, y) as a tuple or an array; x points right, y points up
 Points = Any  # a sequence of points, or an array (points, 2)

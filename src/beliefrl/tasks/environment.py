@@ -18,10 +18,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key, UInt8
 
 from beliefrl import tasks
+from beliefrl.errors import UserError
 from beliefrl.tasks import Task
 from beliefrl.tasks.drawing import Picture, Viewer, paint
 from beliefrl.tasks.variants import FaultyState
-from beliefrl.types import LARGEST, UserError
+from beliefrl.types import LARGEST
 
 # The task is a static argument, so environments of equal tasks share one compiled program.
 

@@ -14,7 +14,8 @@ import numbers
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from beliefrl.types import LARGEST, UserError, check_choice, check_range, short, tuples
+from beliefrl.errors import UserError, short
+from beliefrl.types import LARGEST, check_choice, check_range, tuples
 
 LONGEST_DELAY = 10_000
 STREAM = 1_179_406_420  # separates the random numbers of faults from those of the task, which has the same key

@@ -13,12 +13,13 @@ from typing import Any
 import gymnasium
 
 from beliefrl.catalogue import our_task_names
+from beliefrl.errors import UserError, said, short
 from beliefrl.tasks.faults import NONE, Faults
 from beliefrl.tasks.interface import Interface, check_measures, interface_of
 from beliefrl.tasks.repeat import LONGEST
 from beliefrl.tasks.seen_environment import Environment, FaultyEnvironment
 from beliefrl.tasks.settings import settings_kept
-from beliefrl.types import LARGEST, Spec, UserError, check_range, said, short
+from beliefrl.types import LARGEST, Spec, check_range
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -10,12 +10,12 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 
-from beliefrl.errors import Fault
+from beliefrl.errors import Fault, UserError, said, short
 from beliefrl.tasks.faults import STREAM, Draws
 from beliefrl.tasks.interface import measure_of
 from beliefrl.tasks.repeat import actions
 from beliefrl.tasks.spaces import check_actions, flat_bounds, flat_size, limits, misfit, observation_names, scale
-from beliefrl.types import UserError, as_array, check_indices, said, short
+from beliefrl.types import as_array, check_indices
 
 _in_use: weakref.WeakValueDictionary[int, Any] = weakref.WeakValueDictionary()  # innermost environments by their id
 ENDLESS = 10_000  # steps after which an episode without a time limit is considered endless

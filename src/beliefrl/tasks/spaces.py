@@ -15,7 +15,8 @@ from gymnasium import spaces
 from jaxtyping import Float, Int
 
 from beliefrl.catalogue import KNOWN, PREFIX
-from beliefrl.types import UserError, as_array, short
+from beliefrl.errors import UserError, short
+from beliefrl.types import as_array
 
 FREE_JOINT, BALL_JOINT, SLIDE_JOINT = 0, 1, 2  # types of MuJoCo's joints; a hinge is 3
 AXES = ("x", "y", "z")

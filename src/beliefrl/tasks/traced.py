@@ -5,7 +5,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from beliefrl.types import Spec, UserError, check_whole, said, short
+from beliefrl.errors import UserError, said, short
+from beliefrl.types import Spec, check_whole
 
 
 def check_traced(task: Any, name: str) -> None:

@@ -9,11 +9,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
+from beliefrl.errors import UserError, short
 from beliefrl.tasks.faults import NONE, STREAM, Draws, Faults
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.repeat import LONGEST, actions, repeated_step
 from beliefrl.tasks.traced import check_spec
-from beliefrl.types import Spec, UserError, check_indices, check_whole, short
+from beliefrl.types import Spec, check_indices, check_whole
 
 
 class FaultyState(NamedTuple):

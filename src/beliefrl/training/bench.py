@@ -19,13 +19,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
 from beliefrl.agents import Agent
-from beliefrl.runs.options import Precision
+from beliefrl.errors import UserError
+from beliefrl.runs.options import Options, Precision
 from beliefrl.training import phases
 from beliefrl.training import replay as ring
 from beliefrl.training.rounding import at_precision
 from beliefrl.training.rounds import stretch_length
-from beliefrl.training.schedule import Options, capacity
-from beliefrl.types import Spec, UserError, check_range
+from beliefrl.training.schedule import capacity
+from beliefrl.types import Spec, check_range
 
 PAPER_STEPS = 100_000  # steps of the wall-clock times in the paper's scalability table
 REPEATS = 9

@@ -5,13 +5,14 @@ import shlex
 from typing import Any
 
 from beliefrl import tasks
+from beliefrl.errors import UserError, short
 from beliefrl.runs import trackers
 from beliefrl.runs.options import Options
 from beliefrl.runs.records import steps_per_action
 from beliefrl.runs.run import Run
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.traced import check_traced
-from beliefrl.types import UserError, plain, short
+from beliefrl.types import plain
 
 RECORDING = ("processes", "checkpoint_steps", "checkpoint_minutes", "keep_checkpoints", "track")
 CHANGEABLE = ("steps", "stop_at", "stop_patience", "step_timeout", *RECORDING)  # may differ when a training continues

@@ -13,6 +13,7 @@ from rich.text import Text
 from beliefrl.agents.hyperparameters import values_before
 from beliefrl.analysis.figures import curve_figure
 from beliefrl.analysis.tables import measure_text
+from beliefrl.errors import UserError
 from beliefrl.runs.best import evaluations
 from beliefrl.runs.checkpoint import listed
 from beliefrl.runs.records import finite_mean, finite_or_none, sessions
@@ -21,7 +22,7 @@ from beliefrl.training.restore import as_argument
 from beliefrl.training.schedule import Event, Phase
 from beliefrl.training.screen import Screen, duration
 from beliefrl.training.summary import MODES
-from beliefrl.types import UserError, plain
+from beliefrl.types import plain
 
 
 class TrainingDisplay:

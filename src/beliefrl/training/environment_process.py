@@ -11,10 +11,9 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from beliefrl.errors import Fault
+from beliefrl.errors import Fault, UserError
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.stop import SIGNALS
-from beliefrl.types import UserError
 
 CLOSING = 60.0  # seconds that an environment has to close
 

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Key
 
 from beliefrl.agents import Agent
+from beliefrl.errors import UserError
 from beliefrl.runs.options import MOST_EPISODES
 from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
@@ -23,7 +24,7 @@ from beliefrl.training.phases import evaluate as evaluate_seed
 from beliefrl.training.restore import restore
 from beliefrl.training.rollout import Episode
 from beliefrl.training.summary import MODES, summary
-from beliefrl.types import UserError, check_whole
+from beliefrl.types import check_whole
 
 
 def evaluate(

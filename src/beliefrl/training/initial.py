@@ -14,13 +14,14 @@ import numpy as np
 from beliefrl import agents
 from beliefrl.agents import Agent
 from beliefrl.agents.hyperparameters import named_by, values_before
+from beliefrl.errors import UserError
 from beliefrl.runs import arrays, best
 from beliefrl.runs.options import Options
 from beliefrl.runs.records import sessions
 from beliefrl.runs.run import Run
 from beliefrl.training import initial_replay
 from beliefrl.training.phases import SeedState
-from beliefrl.types import Spec, UserError, plain
+from beliefrl.types import Spec, plain
 
 FILE = "initial.safetensors"
 

@@ -14,6 +14,7 @@ import numpy as np
 from beliefrl import tasks
 from beliefrl.agents import Agent
 from beliefrl.agents.hyperparameters import named_by, values_before
+from beliefrl.errors import UserError
 from beliefrl.runs import arrays, segments
 from beliefrl.runs.checkpoint import stored_timesteps
 from beliefrl.runs.options import Options
@@ -22,7 +23,7 @@ from beliefrl.training import rollout
 from beliefrl.training.checks import about_task, decisive
 from beliefrl.training.replay import Replay
 from beliefrl.training.restore import check_interface
-from beliefrl.types import Spec, UserError, plain
+from beliefrl.types import Spec, plain
 
 FILE = "initial-replay.safetensors"
 ADDED = "added"  # the number of timesteps of each ring, among the arrays of the file

@@ -19,12 +19,11 @@ from gymnasium import logger
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from beliefrl.errors import Fault
+from beliefrl.errors import Fault, UserError, said
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.seen_environment import Environment
 from beliefrl.tasks.settings import settings_kept
 from beliefrl.training.environment_process import CLOSING, Factory
-from beliefrl.types import UserError, said
 
 HANDOVER = 5e-4  # approximate seconds for passing a step to other processes
 SLOW = 60.0  # seconds after which a call that has not returned is reported

@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, Key
 
-from beliefrl.types import Reading, StoredTimestep, Timestep, UserError, Window, WindowShape
+from beliefrl.errors import UserError
+from beliefrl.types import Reading, StoredTimestep, Timestep, Window, WindowShape
 
 
 class Replay(NamedTuple):

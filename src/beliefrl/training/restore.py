@@ -15,6 +15,7 @@ import numpy as np
 from beliefrl import agents, tasks
 from beliefrl.agents import Agent, hyperparameters
 from beliefrl.catalogue import MASKS, split_mask
+from beliefrl.errors import UserError, one_line
 from beliefrl.imports import path
 from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
@@ -22,7 +23,7 @@ from beliefrl.tasks.faults import Faults
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.interface import Interface
 from beliefrl.training.checks import about_task
-from beliefrl.types import LARGEST, Spec, UserError, one_line, tuples
+from beliefrl.types import LARGEST, Spec, tuples
 
 
 def restore(

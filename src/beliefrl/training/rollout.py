@@ -18,11 +18,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from beliefrl.agents import Agent
+from beliefrl.errors import UserError
 from beliefrl.tasks import Task
 from beliefrl.tasks.interface import check_measures
 from beliefrl.training import replay as ring
 from beliefrl.training.replay import Replay
-from beliefrl.types import Spec, StoredTimestep, Timestep, UserError
+from beliefrl.types import Spec, StoredTimestep, Timestep
 
 
 class ActorState(NamedTuple):

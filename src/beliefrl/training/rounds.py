@@ -15,11 +15,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
 from beliefrl.agents import Agent
+from beliefrl.errors import UserError
 from beliefrl.training import replay as ring
 from beliefrl.training.keys import CYCLE, SAMPLE, UPDATE, step_key
 from beliefrl.training.replay import Readers, Replay
 from beliefrl.training.rounding import at_precision
-from beliefrl.types import UserError, Window
+from beliefrl.types import Window
 
 Metrics = dict[str, Float[Array, "..."]]
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from beliefrl.agents import Agent
-from beliefrl.errors import Fault
+from beliefrl.errors import Fault, UserError
 from beliefrl.runs.options import Options, Processes
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import GymnasiumTask
@@ -23,7 +23,6 @@ from beliefrl.training.lockstep import Lockstep
 from beliefrl.training.phases import Program, SeedState
 from beliefrl.training.rollout import Episode
 from beliefrl.training.rounds import Metrics, round_length, stretch_length
-from beliefrl.types import UserError
 
 
 class TrainingProgress(NamedTuple):

@@ -18,6 +18,7 @@ import numpy as np
 
 from beliefrl.agents import Agent
 from beliefrl.analysis.figures import draw_curve
+from beliefrl.errors import UserError, cause
 from beliefrl.runs.checkpoint import Checkpoints
 from beliefrl.runs.folder import set_aside
 from beliefrl.runs.options import Options
@@ -31,7 +32,6 @@ from beliefrl.training.phases import SeedState
 from beliefrl.training.restore import as_argument
 from beliefrl.training.schedule import Event, Phase, Snapshot, TrainingProgress, stages
 from beliefrl.training.stop import Requests, Stopped
-from beliefrl.types import UserError, cause
 
 Callback = Callable[[Event], Any]  # returns True to stop the training
 RENAMED = {".actor.episode_return": ".actor.total"}  # arrays in checkpoints: the present name, the old one

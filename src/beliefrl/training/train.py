@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from beliefrl import agents, tasks
 from beliefrl.agents import Agent, hyperparameters
-from beliefrl.errors import OfCallback
+from beliefrl.errors import OfCallback, UserError
 from beliefrl.runs.checkpoint import listed, was_ever_written
 from beliefrl.runs.folder import free_folder
 from beliefrl.runs.options import NAMES, Options
@@ -21,7 +21,6 @@ from beliefrl.training import checks, initial, initial_replay
 from beliefrl.training.restore import agent_of, check_interface, task_of
 from beliefrl.training.schedule import Event, capacity
 from beliefrl.training.session import Callback, Session
-from beliefrl.types import UserError
 
 
 def train(

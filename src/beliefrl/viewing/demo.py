@@ -9,9 +9,9 @@ import pathlib
 import shutil
 import zipfile
 
+from beliefrl.errors import UserError, cause, short
 from beliefrl.runs.given_files import as_path
 from beliefrl.runs.run import Run
-from beliefrl.types import UserError, cause, short
 
 FOLDER = pathlib.Path(__file__).parent / "demos"
 

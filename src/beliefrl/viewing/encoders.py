@@ -8,8 +8,8 @@ from typing import Any
 
 from PIL import Image
 
+from beliefrl.errors import UserError, cause
 from beliefrl.runs.arrays import replacing
-from beliefrl.types import UserError, cause
 from beliefrl.viewing.episodes import Pixels
 
 Writer = Callable[[Pixels], None]

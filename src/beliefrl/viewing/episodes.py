@@ -25,6 +25,7 @@ from jaxtyping import Int, UInt8
 from beliefrl import tasks
 from beliefrl.agents import Agent
 from beliefrl.analysis.tables import measure_text
+from beliefrl.errors import UserError, said
 from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.environment import TaskEnvironment
@@ -32,7 +33,7 @@ from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.interface import measure_of
 from beliefrl.tasks.seen_environment import Environment
 from beliefrl.training.restore import check_interface, restore_seed, task_of
-from beliefrl.types import LARGEST, Timestep, UserError, check_whole, said
+from beliefrl.types import LARGEST, Timestep, check_whole
 
 Pixels = UInt8[np.ndarray, "height width 3"]
 PACE = 10  # steps per second of a task whose steps have no known duration

@@ -18,13 +18,14 @@ from PIL import Image, ImageDraw, ImageFont
 
 from beliefrl.agents import Agent, is_own
 from beliefrl.analysis import figures
+from beliefrl.errors import UserError
 from beliefrl.runs.given_files import check_folder
 from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.drawing import INK, PAPER, Viewer
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.restore import restore_seed
-from beliefrl.types import LARGEST, UserError, check_whole
+from beliefrl.types import LARGEST, check_whole
 from beliefrl.viewing.encoders import Writer, encoder
 from beliefrl.viewing.episodes import Frame, Pixels, Player, Trajectory, check_episode, pace_of
 

@@ -27,12 +27,13 @@ from jaxtyping import Array, Bool, Float, Key
 from beliefrl import tasks
 from beliefrl.agents import Agent, Predictive
 from beliefrl.analysis import figures
+from beliefrl.errors import UserError
 from beliefrl.models.nets import Gaussian
 from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training.restore import restore_seed
-from beliefrl.types import Timestep, UserError, check_whole, perception
+from beliefrl.types import Timestep, check_whole, perception
 from beliefrl.viewing.episodes import Player, check_episode
 
 START = 50  # default number of timesteps that the closed loop observes
