@@ -23,7 +23,7 @@ from gymnasium.spaces import Box
 from beliefrl import agents, onnx
 from beliefrl.agents import Agent
 from beliefrl.errors import UserError
-from beliefrl.policy_inputs import check_finite, each, flags, numbers
+from beliefrl.policy_inputs import State, check_finite, each, fitting, flags, numbers
 from beliefrl.runs.given_files import check_folder, write_given
 from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
@@ -33,8 +33,6 @@ from beliefrl.tasks.interface import Interface
 from beliefrl.tasks.spaces import scale
 from beliefrl.training.restore import check_interface, restore_policy, task_of
 from beliefrl.types import LARGEST, Spec, Timestep, check_whole
-
-State = tuple[np.ndarray, ...]
 
 
 class Policy:
@@ -151,7 +149,7 @@ class Policy:
         reward = np.where(starts, 0, reward)
         check_finite(given, "obs")
         check_finite(reward.reshape(() if single else batch), "reward")
-        state = self.initial_state(batch) if state is None else self._fitting(state, batch)
+        state = self.initial_state(batch) if state is None else fitting(state, self.initial_state(batch))
         (mode,) = flags(deterministic, 1, "deterministic")
         self._calls += 1
         seed = np.uint32((self.seed * 1_000_003 + self._calls) % (LARGEST + 1))
@@ -194,20 +192,6 @@ class Policy:
             name = agents.name_of(self.agent)
             raise UserError(f"reward is missing: {name} observes it. Give the reward that came with obs.")
         self._ignores_reward = True
-
-    def _fitting(self, state: Any, batch: int) -> State:
-        """The same state, after a check that it is a state of this policy for `batch` episodes."""
-        wanted = [(leaf.shape, leaf.dtype) for leaf in self.initial_state(batch)]
-        leaves = list(state) if isinstance(state, tuple | list) else []
-        if [(np.shape(leaf), getattr(leaf, "dtype", None)) for leaf in leaves] != wanted:
-            raise UserError(
-                f"state is not one of this policy for {_count(batch, 'episode')}: give the second result of `predict`, "
-                "or None at the start of all episodes."
-            )
-        for leaf in leaves:
-            if np.issubdtype(leaf.dtype, np.floating) and not np.isfinite(leaf).all():
-                raise UserError("state holds a number that is not finite: give the second result of `predict`.")
-        return tuple(leaves)
 
     def export(self, path: str | os.PathLike[str], overwrite: bool = False) -> float | None:
         """Write the policy to one file that runs without this library, for any batch size.
@@ -293,7 +277,3 @@ def _environment(run: Run, task: Any) -> Any:
 def _where_first(is_first: Any, empty: Any, leaf: Any) -> Any:
     """`empty` for the episodes that start, `leaf` for the others; leaves (batch, ...)."""
     return jnp.where(is_first.reshape(-1, *[1] * (leaf.ndim - 1)), empty, leaf)
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"

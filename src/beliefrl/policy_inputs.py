@@ -8,6 +8,8 @@ import numpy as np
 from beliefrl.errors import UserError, short
 from beliefrl.types import as_array
 
+State = tuple[np.ndarray, ...]  # the leaves of the memory and the previous action, each (batch, ...)
+
 
 def numbers(value: Any, name: str) -> np.ndarray:
     """The value of obs or reward as an array of real numbers.
@@ -39,6 +41,22 @@ def each(array: np.ndarray, batch: int, name: str) -> np.ndarray:
     if array.shape not in ((), (batch,)):
         raise UserError(f"{name} has the shape {array.shape}: it must be one number or ({batch},).")
     return np.broadcast_to(array, (batch,))
+
+
+def fitting(state: Any, like: State) -> State:
+    """The state, after a check that it has the shapes and types of `like`, and finite numbers."""
+    wanted = [(leaf.shape, leaf.dtype) for leaf in like]
+    leaves = list(state) if isinstance(state, tuple | list) else []
+    if [(np.shape(leaf), getattr(leaf, "dtype", None)) for leaf in leaves] != wanted:
+        batch = len(like[0])
+        raise UserError(
+            f"state is not one of this policy for {batch} episode{'' if batch == 1 else 's'}: give the second result "
+            "of `predict`, or None at the start of all episodes."
+        )
+    for leaf in leaves:
+        if np.issubdtype(leaf.dtype, np.floating) and not np.isfinite(leaf).all():
+            raise UserError("state holds a number that is not finite: give the second result of `predict`.")
+    return tuple(leaves)
 
 
 def check_finite(array: np.ndarray, name: str) -> None:
