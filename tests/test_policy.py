@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 import beliefrl
 from beliefrl import agents, tasks
@@ -16,6 +17,8 @@ from beliefrl.policy import Policy
 from beliefrl.runs.run import Run
 from beliefrl.tasks import make
 from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.tasks.interface import Interface
+from beliefrl.tasks.spaces import scale
 from beliefrl.training import rollout
 from worlds import TINY, begun, saved, tiny
 from wrong import Fine
@@ -225,3 +228,14 @@ def test_actions_are_scaled_to_the_bounds_of_the_environment(tmp_path):
             policy.scale(wrong)
     with pytest.raises(UserError, match=r"a task in JAX has none, its actions are in \[-1, 1\]"):
         beliefrl.load(saved(tmp_path / "other", "sac-mlp", make("pendulum"))).scale([0.0])
+
+
+@pytest.mark.parametrize(("bound", "kind"), [(0.3, np.float32), (0.3, np.float64), (1.0, np.float64)])
+def test_a_scaled_action_is_one_of_the_environments_actions(bound, kind):
+    space = spaces.Box(-bound, bound, (2,), kind)
+    interface = Interface(("angle",), space.low.tolist(), space.high.tolist())
+    policy = Policy(*_with_spec("sac-mlp"), interface=interface)
+    for action in ([-1.0, 1.0], [1.0, -1.0], [0.3, -0.7]):
+        scaled = policy.scale(action)
+        assert space.contains(scaled)
+        np.testing.assert_allclose(scaled, scale(space, np.array(action)), rtol=1e-6)

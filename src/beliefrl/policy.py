@@ -171,7 +171,7 @@ class Policy:
             action: an action of `predict`, (action,) or (batch, action); it is clipped to [-1, 1].
 
         Returns:
-            low + (action + 1) / 2 · (high - low), of the same shape.
+            low + (action + 1) / 2 · (high - low), of the same shape; float32, or float64 if the bounds need it.
 
         Raises:
             UserError: the policy has no bounds, because it was trained on a task in JAX; or the action has the wrong
@@ -179,7 +179,9 @@ class Policy:
         """
         if self.interface is None:
             raise UserError("scale needs bounds of actions: a task in JAX has none, its actions are in [-1, 1].")
-        space = Box(np.array(self.interface.low), np.array(self.interface.high), dtype=np.float64)
+        bounds = np.array([self.interface.low, self.interface.high])
+        kind = np.float32 if np.array_equal(bounds.astype(np.float32), bounds) else np.float64  # which a Box accepts
+        space = Box(*bounds.astype(kind), dtype=kind)
         given = numbers(action, "action")
         if given.shape[-1:] != space.shape:
             raise UserError(f"action has the shape {given.shape}: it must end with {space.shape[0]}.")
