@@ -69,6 +69,18 @@ def _with_spec(name):
     return agent, TASK.spec, state
 
 
+@pytest.mark.parametrize("obs", [[0.1, 0.2], [[0.1, 0.2], [0.3, 0.4]]])
+def test_an_action_may_be_changed_in_place(obs):
+    policy = Policy(*_with_spec("vrm"))
+    action, state = policy.predict(obs)
+    kept = tuple(part.copy() for part in state)
+    action *= 2.0
+    changed, _ = policy.predict(obs, -1.0, state)
+    np.testing.assert_array_equal(changed, policy.predict(obs, -1.0, kept)[0])
+    state[-1][:] = 0.0  # the state may be changed, too
+    assert not np.array_equal(policy.predict(obs, -1.0, state)[0], changed)
+
+
 def test_samples_differ_and_come_back_with_their_seed():
     drawn = {}
     for seed in (1, 1, 2):

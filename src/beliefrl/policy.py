@@ -154,15 +154,19 @@ class Policy:
         self._calls += 1
         seed = np.uint32((self.seed * 1_000_003 + self._calls) % (LARGEST + 1))
         obs, reward = obs.astype(np.float32), reward.astype(np.float32)
-        action, after = jax.device_get(self._act(obs, reward, state, starts, seed, mode))
+        action, after = self._called(obs, reward, state, starts, seed, mode)
         if is_missing and not self._ignores_reward:
-            other = jax.device_get(self._act(obs, np.full_like(reward, np.nan), state, starts, seed, mode))
-            self._check_unused(after, other[1])
+            _, other = self._called(obs, np.full_like(reward, np.nan), state, starts, seed, mode)
+            self._check_unused(after, other)
         finite = np.all([np.isfinite(leaf.reshape(batch, -1)).all(axis=1) for leaf in after], axis=0)
         for episode in np.flatnonzero(~finite):
             which = "" if single else f" of episode {episode}"
             raise UserError(f"obs or reward{which} is too large for this policy: its action would not be finite.")
         return (action[0] if single else action), after
+
+    def _called(self, *inputs: Any) -> tuple[np.ndarray, State]:
+        """`_step` in numpy. The caller may change these arrays; the action is not that in the state."""
+        return jax.tree.map(np.array, jax.device_get(self._act(*inputs)))
 
     def scale(self, action: Any) -> np.ndarray:
         """Scale actions to the bounds of the actions of the Gymnasium environment of the training.
