@@ -57,8 +57,9 @@ class Policy:
         """
         self.agent, self.spec, self.seed, self.precision, self.task = agent, spec, seed, precision, task
         self.environment, self.interface = environment, interface
-        self._state = jax.device_put(state)
-        self._empty = jax.device_get(agent.reset(spec))  # the memory at the start of an episode
+        with jax.enable_x64(False):  # another library of the program may need 64 bits
+            self._state = jax.device_put(state)
+            self._empty = jax.device_get(agent.reset(spec))  # the memory at the start of an episode
         self._act = jax.jit(self._step)
         self._calls = 0
         self._ignores_reward = False  # found when a reward is left out
@@ -166,7 +167,8 @@ class Policy:
 
     def _called(self, *inputs: Any) -> tuple[np.ndarray, State]:
         """`_step` in numpy. The caller may change these arrays; the action is not that in the state."""
-        return jax.tree.map(np.array, jax.device_get(self._act(*inputs)))
+        with jax.enable_x64(False):
+            return jax.tree.map(np.array, jax.device_get(self._act(*inputs)))
 
     def scale(self, action: Any) -> np.ndarray:
         """Scale actions to the bounds of the actions of the Gymnasium environment of the training.
@@ -239,7 +241,8 @@ class Policy:
         state = tuple(shaped((batch, *leaf.shape[1:]), leaf.dtype) for leaf in self.initial_state(1))
         numbers = shaped((batch, self.spec.obs_dim), jnp.float32), shaped((batch,), jnp.float32)
         rest = shaped((batch,), jnp.bool_), shaped((), jnp.uint32), shaped((), jnp.bool_)
-        return bytes(jax.export.export(self._act, platforms=("cpu", "cuda"))(*numbers, state, *rest).serialize())
+        with jax.enable_x64(False):
+            return bytes(jax.export.export(self._act, platforms=("cpu", "cuda"))(*numbers, state, *rest).serialize())
 
 
 def load(
