@@ -81,6 +81,15 @@ def test_an_action_may_be_changed_in_place(obs):
     assert not np.array_equal(policy.predict(obs, -1.0, state)[0], changed)
 
 
+def test_bools_are_numbers_as_in_a_training():
+    policy = Policy(*_with_spec("vrm"))
+    action, state = policy.predict([True, False])
+    np.testing.assert_array_equal(action, policy.predict([1.0, 0.0])[0])
+    for reached in (True, np.bool_(True)):
+        action, _ = policy.predict(np.array([False, True]), reached, state)
+        np.testing.assert_array_equal(action, policy.predict([0.0, 1.0], 1.0, state)[0])
+
+
 def test_samples_differ_and_come_back_with_their_seed():
     drawn = {}
     for seed in (1, 1, 2):
@@ -103,11 +112,12 @@ def test_samples_differ_and_come_back_with_their_seed():
         ({"obs": "abc"}, "obs must be real numbers, not 'abc'"),
         ({"obs": [0.0, None]}, "entry 1 of obs is None: give finite numbers"),
         ({"obs": [[0.0, 0.0], [None, 0.0]]}, "entry 0 of obs of episode 1 is None"),
-        ({"obs": [True, False]}, r"obs must be real numbers, not \[True, False\]"),
         ({"obs": np.array([0.0, 0.0], object)}, "obs must be real numbers, not array"),
         ({"obs": None}, "obs is None"),
         ({"obs": np.zeros((0, 2))}, "obs has no episodes"),
-        ({"obs": [0.0, 0.0], "reward": True}, "reward must be real numbers, not True"),
+        ({"obs": np.zeros((2, 2)), "reward": [True, False]}, r"reward must be real numbers, not \[True, False\]"),
+        ({"obs": True}, r"obs has the shape \(\): it must be"),
+        ({"obs": [0.0, 0.0], "state": True}, "state is not one of this policy for 1 episode"),
         ({"obs": [0.0, 0.0], "state": 1.0}, "state is not one of this policy for 1 episode"),
         ({"obs": [1j, 0.0]}, "obs must be real numbers"),
         ({"obs": [[0.0, 0.0], [0.0]]}, "obs must be real numbers"),

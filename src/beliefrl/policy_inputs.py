@@ -12,7 +12,10 @@ State = tuple[np.ndarray, ...]  # the leaves of the memory and the previous acti
 
 
 def numbers(value: Any, name: str) -> np.ndarray:
-    """The value of obs or reward as an array of real numbers.
+    """The value of obs, reward or action as an array of real numbers.
+
+    As in a training, an observation and one reward may be bools: 1 where True. Several bools as the reward are refused,
+    since they are rather the flags of episodes.
 
     Raises:
         UserError: an entry is not a number.
@@ -23,7 +26,8 @@ def numbers(value: Any, name: str) -> np.ndarray:
     for index, entry in np.ndenumerate(array if array.dtype == object else ()):
         if not isinstance(entry, Real):
             raise UserError(f"{_place(name, index)} is {short(entry)}: give finite numbers.")
-    if array.dtype.kind not in "iuf":
+    may_be_bool = name == "obs" or (name == "reward" and array.shape == ())
+    if array.dtype.kind not in ("biuf" if may_be_bool else "iuf"):
         raise UserError(f"{name} must be real numbers, not {short(value)}: the arguments are obs, reward, state.")
     return array
 
