@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 import beliefrl
 from beliefrl import agents, tasks
@@ -16,6 +17,8 @@ from beliefrl.policy import Policy
 from beliefrl.runs.run import Run
 from beliefrl.tasks import make
 from beliefrl.tasks.gymnasium import GymnasiumTask
+from beliefrl.tasks.interface import Interface
+from beliefrl.tasks.spaces import scale
 from beliefrl.training import rollout
 from worlds import TINY, begun, saved, tiny
 from wrong import Fine
@@ -66,6 +69,27 @@ def _with_spec(name):
     return agent, TASK.spec, state
 
 
+@pytest.mark.parametrize("obs", [[0.1, 0.2], [[0.1, 0.2], [0.3, 0.4]]])
+def test_an_action_may_be_changed_in_place(obs):
+    policy = Policy(*_with_spec("vrm"))
+    action, state = policy.predict(obs)
+    kept = tuple(part.copy() for part in state)
+    action *= 2.0
+    changed, _ = policy.predict(obs, -1.0, state)
+    np.testing.assert_array_equal(changed, policy.predict(obs, -1.0, kept)[0])
+    state[-1][:] = 0.0  # the state may be changed, too
+    assert not np.array_equal(policy.predict(obs, -1.0, state)[0], changed)
+
+
+def test_bools_are_numbers_as_in_a_training():
+    policy = Policy(*_with_spec("vrm"))
+    action, state = policy.predict([True, False])
+    np.testing.assert_array_equal(action, policy.predict([1.0, 0.0])[0])
+    for reached in (True, np.bool_(True)):
+        action, _ = policy.predict(np.array([False, True]), reached, state)
+        np.testing.assert_array_equal(action, policy.predict([0.0, 1.0], 1.0, state)[0])
+
+
 def test_samples_differ_and_come_back_with_their_seed():
     drawn = {}
     for seed in (1, 1, 2):
@@ -88,11 +112,12 @@ def test_samples_differ_and_come_back_with_their_seed():
         ({"obs": "abc"}, "obs must be real numbers, not 'abc'"),
         ({"obs": [0.0, None]}, "entry 1 of obs is None: give finite numbers"),
         ({"obs": [[0.0, 0.0], [None, 0.0]]}, "entry 0 of obs of episode 1 is None"),
-        ({"obs": [True, False]}, r"obs must be real numbers, not \[True, False\]"),
         ({"obs": np.array([0.0, 0.0], object)}, "obs must be real numbers, not array"),
         ({"obs": None}, "obs is None"),
         ({"obs": np.zeros((0, 2))}, "obs has no episodes"),
-        ({"obs": [0.0, 0.0], "reward": True}, "reward must be real numbers, not True"),
+        ({"obs": np.zeros((2, 2)), "reward": [True, False]}, r"reward must be real numbers, not \[True, False\]"),
+        ({"obs": True}, r"obs has the shape \(\): it must be"),
+        ({"obs": [0.0, 0.0], "state": True}, "state is not one of this policy for 1 episode"),
         ({"obs": [0.0, 0.0], "state": 1.0}, "state is not one of this policy for 1 episode"),
         ({"obs": [1j, 0.0]}, "obs must be real numbers"),
         ({"obs": [[0.0, 0.0], [0.0]]}, "obs must be real numbers"),
@@ -225,3 +250,14 @@ def test_actions_are_scaled_to_the_bounds_of_the_environment(tmp_path):
             policy.scale(wrong)
     with pytest.raises(UserError, match=r"a task in JAX has none, its actions are in \[-1, 1\]"):
         beliefrl.load(saved(tmp_path / "other", "sac-mlp", make("pendulum"))).scale([0.0])
+
+
+@pytest.mark.parametrize(("bound", "kind"), [(0.3, np.float32), (0.3, np.float64), (1.0, np.float64)])
+def test_a_scaled_action_is_one_of_the_environments_actions(bound, kind):
+    space = spaces.Box(-bound, bound, (2,), kind)
+    interface = Interface(("angle",), space.low.tolist(), space.high.tolist())
+    policy = Policy(*_with_spec("sac-mlp"), interface=interface)
+    for action in ([-1.0, 1.0], [1.0, -1.0], [0.3, -0.7]):
+        scaled = policy.scale(action)
+        assert space.contains(scaled)
+        np.testing.assert_allclose(scaled, scale(space, np.array(action)), rtol=1e-6)

@@ -23,7 +23,7 @@ from gymnasium.spaces import Box
 from beliefrl import agents, onnx
 from beliefrl.agents import Agent
 from beliefrl.errors import UserError
-from beliefrl.policy_inputs import check_finite, each, flags, numbers
+from beliefrl.policy_inputs import State, check_finite, each, fitting, flags, numbers
 from beliefrl.runs.given_files import check_folder, write_given
 from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
@@ -33,8 +33,6 @@ from beliefrl.tasks.interface import Interface
 from beliefrl.tasks.spaces import scale
 from beliefrl.training.restore import check_interface, restore_policy, task_of
 from beliefrl.types import LARGEST, Spec, Timestep, check_whole
-
-State = tuple[np.ndarray, ...]
 
 
 class Policy:
@@ -59,8 +57,9 @@ class Policy:
         """
         self.agent, self.spec, self.seed, self.precision, self.task = agent, spec, seed, precision, task
         self.environment, self.interface = environment, interface
-        self._state = jax.device_put(state)
-        self._empty = jax.device_get(agent.reset(spec))  # the memory at the start of an episode
+        with jax.enable_x64(False):  # another library of the program may need 64 bits
+            self._state = jax.device_put(state)
+            self._empty = jax.device_get(agent.reset(spec))  # the memory at the start of an episode
         self._act = jax.jit(self._step)
         self._calls = 0
         self._ignores_reward = False  # found when a reward is left out
@@ -151,20 +150,25 @@ class Policy:
         reward = np.where(starts, 0, reward)
         check_finite(given, "obs")
         check_finite(reward.reshape(() if single else batch), "reward")
-        state = self.initial_state(batch) if state is None else self._fitting(state, batch)
+        state = self.initial_state(batch) if state is None else fitting(state, self.initial_state(batch))
         (mode,) = flags(deterministic, 1, "deterministic")
         self._calls += 1
         seed = np.uint32((self.seed * 1_000_003 + self._calls) % (LARGEST + 1))
         obs, reward = obs.astype(np.float32), reward.astype(np.float32)
-        action, after = jax.device_get(self._act(obs, reward, state, starts, seed, mode))
+        action, after = self._called(obs, reward, state, starts, seed, mode)
         if is_missing and not self._ignores_reward:
-            other = jax.device_get(self._act(obs, np.full_like(reward, np.nan), state, starts, seed, mode))
-            self._check_unused(after, other[1])
+            _, other = self._called(obs, np.full_like(reward, np.nan), state, starts, seed, mode)
+            self._check_unused(after, other)
         finite = np.all([np.isfinite(leaf.reshape(batch, -1)).all(axis=1) for leaf in after], axis=0)
         for episode in np.flatnonzero(~finite):
             which = "" if single else f" of episode {episode}"
             raise UserError(f"obs or reward{which} is too large for this policy: its action would not be finite.")
         return (action[0] if single else action), after
+
+    def _called(self, *inputs: Any) -> tuple[np.ndarray, State]:
+        """`_step` in numpy. The caller may change these arrays; the action is not that in the state."""
+        with jax.enable_x64(False):
+            return jax.tree.map(np.array, jax.device_get(self._act(*inputs)))
 
     def scale(self, action: Any) -> np.ndarray:
         """Scale actions to the bounds of the actions of the Gymnasium environment of the training.
@@ -173,7 +177,7 @@ class Policy:
             action: an action of `predict`, (action,) or (batch, action); it is clipped to [-1, 1].
 
         Returns:
-            low + (action + 1) / 2 · (high - low), of the same shape.
+            low + (action + 1) / 2 · (high - low), of the same shape; float32, or float64 if the bounds need it.
 
         Raises:
             UserError: the policy has no bounds, because it was trained on a task in JAX; or the action has the wrong
@@ -181,7 +185,9 @@ class Policy:
         """
         if self.interface is None:
             raise UserError("scale needs bounds of actions: a task in JAX has none, its actions are in [-1, 1].")
-        space = Box(np.array(self.interface.low), np.array(self.interface.high), dtype=np.float64)
+        bounds = np.array([self.interface.low, self.interface.high])
+        kind = np.float32 if np.array_equal(bounds.astype(np.float32), bounds) else np.float64  # which a Box accepts
+        space = Box(*bounds.astype(kind), dtype=kind)
         given = numbers(action, "action")
         if given.shape[-1:] != space.shape:
             raise UserError(f"action has the shape {given.shape}: it must end with {space.shape[0]}.")
@@ -194,20 +200,6 @@ class Policy:
             name = agents.name_of(self.agent)
             raise UserError(f"reward is missing: {name} observes it. Give the reward that came with obs.")
         self._ignores_reward = True
-
-    def _fitting(self, state: Any, batch: int) -> State:
-        """The same state, after a check that it is a state of this policy for `batch` episodes."""
-        wanted = [(leaf.shape, leaf.dtype) for leaf in self.initial_state(batch)]
-        leaves = list(state) if isinstance(state, tuple | list) else []
-        if [(np.shape(leaf), getattr(leaf, "dtype", None)) for leaf in leaves] != wanted:
-            raise UserError(
-                f"state is not one of this policy for {_count(batch, 'episode')}: give the second result of `predict`, "
-                "or None at the start of all episodes."
-            )
-        for leaf in leaves:
-            if np.issubdtype(leaf.dtype, np.floating) and not np.isfinite(leaf).all():
-                raise UserError("state holds a number that is not finite: give the second result of `predict`.")
-        return tuple(leaves)
 
     def export(self, path: str | os.PathLike[str], overwrite: bool = False) -> float | None:
         """Write the policy to one file that runs without this library, for any batch size.
@@ -249,7 +241,8 @@ class Policy:
         state = tuple(shaped((batch, *leaf.shape[1:]), leaf.dtype) for leaf in self.initial_state(1))
         numbers = shaped((batch, self.spec.obs_dim), jnp.float32), shaped((batch,), jnp.float32)
         rest = shaped((batch,), jnp.bool_), shaped((), jnp.uint32), shaped((), jnp.bool_)
-        return bytes(jax.export.export(self._act, platforms=("cpu", "cuda"))(*numbers, state, *rest).serialize())
+        with jax.enable_x64(False):
+            return bytes(jax.export.export(self._act, platforms=("cpu", "cuda"))(*numbers, state, *rest).serialize())
 
 
 def load(
@@ -293,7 +286,3 @@ def _environment(run: Run, task: Any) -> Any:
 def _where_first(is_first: Any, empty: Any, leaf: Any) -> Any:
     """`empty` for the episodes that start, `leaf` for the others; leaves (batch, ...)."""
     return jnp.where(is_first.reshape(-1, *[1] * (leaf.ndim - 1)), empty, leaf)
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"

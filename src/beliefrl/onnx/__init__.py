@@ -16,6 +16,7 @@ from collections.abc import Callable
 from typing import Any
 
 import gymnasium
+import jax
 import numpy as np
 
 from beliefrl.errors import UserError, said
@@ -53,7 +54,8 @@ def export(policy: Any, environment: Callable[[], Any] | None = None) -> tuple[b
     outputs = ["action", *(f"next_{name}" for name in parts)]
     interface = {} if policy.interface is None else policy.interface._asdict()
     about = {"policy": repr(policy), **{name: json.dumps(value) for name, value in interface.items()}}
-    content = model(onnx, policy.mode, inputs, outputs, about)
+    with jax.enable_x64(False):
+        content = model(onnx, policy.mode, inputs, outputs, about)
     session = _session(runtime, content)  # before a robot is started
     with contextlib.closing(_made(environment) or _MadeUp(policy.spec.obs_dim)) as made:
         difference = _largest(policy, session, made)

@@ -35,18 +35,30 @@ def restore(
     (`agent_of`). The states are those of the last evaluation, or of the best one of each seed.
 
     Raises:
-        UserError: the run's agent or task is unknown here, or nothing was saved.
+        UserError: the run's agent or task is unknown here, nothing was saved, or JAX is set to 64 bits.
     """
+    check_bits()
     made = agent_of(run, agent)
     found = task_of(run, task)
     check_interface(run, found)
     return made, found, _states(run, made, found.spec, best), run.options.precision
 
 
+def check_bits() -> None:
+    """Raise a UserError if JAX is set to 64 bits, where an agent would be another one. A `Policy` does not mind."""
+    settings: Any = jax.config  # its options are made at import, unknown to pyright
+    if settings.jax_enable_x64:
+        raise UserError(
+            "JAX is set to 64 bits, but agents learn and play with 32: unset JAX_ENABLE_X64, or call "
+            "jax.config.update('jax_enable_x64', False) first."
+        )
+
+
 def _states(run: Run, agent: Agent, spec: Spec, best: bool) -> Any:
-    keys = jax.random.split(jax.random.key(0), len(run.seeds))
-    like = jax.eval_shape(jax.vmap(lambda key: agent.networks(agent.init(key, spec))), keys)
-    return run.load(like, best)
+    with jax.enable_x64(False):
+        keys = jax.random.split(jax.random.key(0), len(run.seeds))
+        like = jax.eval_shape(jax.vmap(lambda key: agent.networks(agent.init(key, spec))), keys)
+        return run.load(like, best)
 
 
 def check_interface(run: Run, task: Any) -> None:

@@ -18,7 +18,7 @@ from beliefrl.runs.run import Run
 from beliefrl.tasks import Task
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import checks, initial, initial_replay
-from beliefrl.training.restore import agent_of, check_interface, task_of
+from beliefrl.training.restore import agent_of, check_bits, check_interface, task_of
 from beliefrl.training.schedule import Event, capacity
 from beliefrl.training.session import Callback, Session
 
@@ -68,6 +68,7 @@ def train(
             KeyboardInterrupt.
     """
     checks.callback(callback)
+    check_bits()
     agent = agents.given(agent)
     made: Any = tasks.given(task)
     chosen = _chosen(options)
@@ -134,6 +135,7 @@ def resume(
         Stopped: Ctrl-C, SIGTERM or SIGHUP, after a checkpoint is written.
     """
     checks.callback(callback)
+    check_bits()
     limits = {"stop_at": stop_at, "step_timeout": step_timeout}
     numbers = {"steps": steps, "stop_patience": stop_patience}
     changes: dict[str, Any] = {name: value for name, value in limits.items() if value != "same"}
