@@ -18,6 +18,7 @@ from beliefrl.tasks.spaces import check_actions, flat_bounds, flat_size, limits,
 from beliefrl.types import as_array, check_indices
 
 _in_use: weakref.WeakValueDictionary[int, Any] = weakref.WeakValueDictionary()  # innermost environments by their id
+HUGE = 1e15  # an observed entry or a reward beyond this: its square, summed over a batch, may not be finite in float32
 ENDLESS = 10_000  # steps after which an episode without a time limit is considered endless
 
 
@@ -160,9 +161,13 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         self.whole = value.reshape(-1)
         with np.errstate(over="ignore"):
             flat = self.whole[self.indices].astype(np.float32)
-        if not np.isfinite(flat).all():
-            entry = int(self.indices[~np.isfinite(flat)][0])
-            raise self._fault(f"entry {entry} of the observation{self._named(entry)} is {self.whole[entry]}")
+        fits = np.abs(flat) <= HUGE  # NaN does not
+        if not fits.all():
+            entry = int(self.indices[~fits][0])
+            raise self._fault(
+                f"entry {entry} of the observation{self._named(entry)} is {self.whole[entry]}, but must be a number "
+                f"from -{HUGE:g} to {HUGE:g}"
+            )
         far = (flat < self._lowest) | (flat > self._highest)
         if far.any():
             entry = int(self.indices[far][0])
@@ -193,9 +198,8 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         if value.shape != () or value.dtype.kind not in "biuf":
             shown = f"of shape {value.shape}" if value.shape else repr(reward)
             raise self._fault(f"the reward is {shown}, but must be one number")
-        with np.errstate(over="ignore"):
-            if not np.isfinite(value.astype(np.float32)):
-                raise self._fault(f"the reward is {value}")
+        if not abs(float(value)) <= HUGE:
+            raise self._fault(f"the reward is {value}, but must be a number from -{HUGE:g} to {HUGE:g}")
         return float(value)
 
     def _flag(self, value: Any, name: str) -> bool:
