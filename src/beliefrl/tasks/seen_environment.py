@@ -32,6 +32,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         """Make the environment and check its spaces."""
         self.task, self.seed = task, seed
         self.steps, self.length = 0, 0  # actions in total, and steps of the environment in this episode
+        self._is_reset = False  # ever
         self._measured: dict[str, float] = {}  # in this episode
         self._bare: Any = None  # the innermost environment, while it is in use
         self.inner = task.bare()
@@ -69,6 +70,9 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         self._lowest, self._highest = limits(self.inner_observation_space, self.indices)
         self.observation_space = spaces.Box(-np.inf, np.inf, (self.indices.size,), np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (self.inner_action_space.low.size,), np.float32)
+        self.render_mode = getattr(self.inner, "render_mode", None)  # an environment may lack both
+        metadata = getattr(self.inner, "metadata", None)
+        self.metadata = metadata if isinstance(metadata, dict) else {}
         self._longest = task.max_steps or _time_limit(self.inner)  # of its own steps
         self.limit = self._longest and actions(self._longest, task.steps_per_action)  # of the agent's
 
@@ -76,14 +80,26 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode."""
-        self.length, self._measured = 0, {}
+        super().reset(seed=seed)
+        self.length, self._measured, self._is_reset = 0, {}, True
         result = self._call("reset", lambda: self.inner.reset(seed=seed, **({"options": options} if options else {})))
         if not (isinstance(result, tuple) and len(result) == 2):
             raise self._fault("reset did not return (observation, info)")
         return self._seen(result[0]), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Apply an action in [-1, 1]."""
+        """Apply an action (action,) in [-1, 1].
+
+        Raises:
+            UserError: the action has the wrong shape, `reset` has not been called, or the environment misbehaves.
+        """
+        if np.shape(action) != self.action_space.shape:
+            raise UserError(f"The action has the shape {np.shape(action)}: it must be {self.action_space.shape}.")
+        if not self._is_reset:
+            raise UserError("The environment has no state yet: call reset first.")
+        return self._apply(action)
+
+    def _apply(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         self.steps, scaled = self.steps + 1, scale(self.inner_action_space, action)
         obs, total, terminated, truncated, info = self._step(scaled.copy())  # the environment may change its array
         for _ in range(self.task.steps_per_action - 1):
@@ -246,11 +262,11 @@ class FaultyEnvironment(Environment):
         self._action = np.zeros(self.inner_action_space.low.size, np.float32)
         return self._observed(obs, self._draws()), info
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Apply an action in [-1, 1], or the previous one again."""
+    def _apply(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Apply an action, or the previous one again."""
         draws = self._draws()
         self._action = self._faults.applied(np, action, self._action, draws)
-        obs, reward, terminated, truncated, info = super().step(self._action)
+        obs, reward, terminated, truncated, info = super()._apply(self._action)
         return self._observed(obs, draws), reward, terminated, truncated, info
 
     def _observed(self, obs: np.ndarray, draws: Draws) -> np.ndarray:
