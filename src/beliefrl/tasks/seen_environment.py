@@ -85,7 +85,8 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         result = self._call("reset", lambda: self.inner.reset(seed=seed, **({"options": options} if options else {})))
         if not (isinstance(result, tuple) and len(result) == 2):
             raise self._fault("reset did not return (observation, info)")
-        return self._seen(result[0]), {}
+        obs, _ = self._seen(result[0]), self._measures(result[1], False)
+        return obs, {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Apply an action (action,) in [-1, 1].
