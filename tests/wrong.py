@@ -153,6 +153,7 @@ UNSUPPORTED = {  # environment: a phrase of the message
 
 PAIR = spaces.MultiDiscrete([2, 3])
 BOXES = spaces.Dict({"arm": BOX, "imu": BOX})
+UNBOUNDED = spaces.Box(-np.inf, np.inf, (2,), np.float32)
 FAULTS = {  # environment: (a phrase of the message, the step that it names)
     observing(PAIR, np.array([1, 2]), np.array([2, 0])): ("does not fit its space MultiDiscrete", 3),
     observing(spaces.Discrete(3), 1, -1): ("does not fit its space Discrete", 3),
@@ -174,6 +175,10 @@ FAULTS = {  # environment: (a phrase of the message, the step that it names)
     with_observation(np.array([0.0, np.nan])): ("entry 1 of the observation is nan", 3),
     with_observation(np.array([np.inf, 0.0])): ("entry 0 of the observation is inf", 3),
     with_observation(np.array([1e300, 0.0])): ("entry 0 of the observation is 1e+300", 3),
+    observing(UNBOUNDED, np.zeros(2), np.array([0.0, 1e25])): (
+        "entry 1 of the observation is 1e+25, but must be a number from -1e+15 to 1e+15",
+        3,
+    ),
     with_observation(np.array([0.0, -202.0])): ("entry 1 of the observation is -202.0, far outside its space", 3),
     with_observation(np.array([1e6, 0.0])): ("which says -1.0 to 1.0: correct the observation", 3),
     with_observation(np.zeros(3)): ("the observation has shape (3,), but its space says (2,)", 3),
@@ -196,6 +201,7 @@ FAULTS = {  # environment: (a phrase of the message, the step that it names)
     with_reward(float("nan")): ("the reward is nan", 3),
     with_reward(float("inf")): ("the reward is inf", 3),
     with_reward(-1e200): ("the reward is -1e+200", 3),
+    with_reward(-1e25): ("the reward is -1e+25, but must be a number from -1e+15 to 1e+15", 3),
     with_reward(np.ones(1)): ("the reward is of shape (1,), but must be one number", 3),
     with_reward(None): ("the reward is None", 3),
     with_reward("much"): ("the reward is 'much'", 3),

@@ -118,7 +118,9 @@ def test_all_refusals_are_named_at_once():
 
 def test_a_fault_is_a_refusal_beside_what_was_seen_until_then():
     found = beliefrl.check(GymnasiumTask(with_observation(np.array([0.0, np.nan])), "robot"))
-    assert found.refusals == ("robot (step 3): entry 1 of the observation is nan.",)
+    assert found.refusals == (
+        "robot (step 3): entry 1 of the observation is nan, but must be a number from -1e+15 to 1e+15.",
+    )
     assert found.steps == 2
     assert found.entries[0].seen_low < found.entries[0].seen_high
 

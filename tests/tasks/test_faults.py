@@ -120,6 +120,27 @@ def test_without_faults_it_is_the_same_task():
     assert type(make("gym:Pendulum-v1").environment()) is Environment
 
 
+class Whole(Echo):
+    """Observes integers."""
+
+    def reset(self, key):
+        return jnp.zeros(()), jnp.array([5, 0])
+
+    def step(self, state, action, key):
+        return action[0], jnp.array([5, 1]), action[0], jnp.array(False)
+
+
+def test_integers_are_observed_with_the_noise_that_was_asked_for(unchecked):
+    obs, _ = compiled_episode(with_faults(Whole(), Faults(noise=(0.5, 0.0), flicker_flag=True)), KEY, ACTIONS)
+    assert abs(obs[:, 0].std() - 0.5) < 0.03
+    assert (obs[1:, 1] == 1).all()
+    assert (obs[:, 2] == 0).all()
+    for task in (Whole(), with_faults(Whole(), Faults(noise=0.5))):
+        environment = TaskEnvironment(task)
+        assert environment.observation_space.contains(environment.reset(seed=0)[0])
+        assert environment.observation_space.contains(environment.step([0.0])[0])
+
+
 def test_faulty_sensors_do_not_change_the_true_episode():
     bare, faults = make("pendulum"), Faults(noise=0.1, flicker=0.5, delay=2)
     true, faulty = (compiled_episode(with_faults(bare, each), KEY, ACTIONS[:30]) for each in (Faults(), faults))

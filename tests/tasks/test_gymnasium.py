@@ -18,7 +18,7 @@ from beliefrl.errors import Fault, UserError
 from beliefrl.tasks import seen_environment
 from beliefrl.tasks.faults import Faults
 from beliefrl.tasks.gymnasium import GymnasiumTask
-from beliefrl.tasks.interface import Interface
+from beliefrl.tasks.interface import Interface, measure_of
 from beliefrl.tasks.registered import _Registered
 from beliefrl.training.lockstep import Lockstep
 from wrong import BOX, FAULTS, UNSUPPORTED, Dictionary, Fine, observing, spaced, with_end
@@ -280,9 +280,9 @@ def test_an_entry_that_is_not_seen_may_be_anything():
     [
         (BOX, [-201.0, 201.0]),  # as far as a hundred widths
         (spaces.Box(0.0, 1e-3, (2,), np.float32), [-100.0, 100.0]),  # a range of less than one counts as one
-        (spaces.Box(-np.inf, np.inf, (2,), np.float32), [-1e30, 1e30]),
-        (spaces.Box(0.0, np.inf, (2,), np.float32), [-1e30, 1e30]),
-        (spaces.Box(-3e38, 3e38, (2,), np.float32), [-3e38, 3e38]),
+        (spaces.Box(-np.inf, np.inf, (2,), np.float32), [-9e14, 9e14]),
+        (spaces.Box(0.0, np.inf, (2,), np.float32), [-9e14, 9e14]),
+        (spaces.Box(-3e38, 3e38, (2,), np.float32), [-9e14, 9e14]),
     ],
 )
 def test_what_leaves_its_range_a_little_is_seen_as_it_is(space, obs):
@@ -459,6 +459,35 @@ def test_a_measure_keeps_the_value_that_was_reported_last():
     assert [each["distance"] for each in seen] == [0, 0, 0.5, 0.5, 0.5]
     environment.reset(seed=0)
     assert environment.step(np.zeros(1))[-1] == {"success": 0, "distance": 0}
+
+
+def test_a_measure_may_be_in_the_info_of_the_reset():
+    class Drawing(Fine):
+        mass = 0.5
+
+        def reset(self, *, seed=None, options=None):
+            obs, _ = super().reset(seed=seed)
+            self.mass += 1.0
+            return obs, {"mass": self.mass}
+
+    environment = GymnasiumTask(Drawing, measures=("mass",)).environment()
+    for mass in (1.5, 2.5):
+        environment.reset(seed=0)
+        seen = [environment.step(np.zeros(1))[-1] for _ in range(10)]  # a whole episode
+        assert seen == [{"mass": mass}] * 10
+
+
+@pytest.mark.parametrize(
+    ("info", "expected"),
+    [
+        ({"is_success": None, "success": True}, 1.0),
+        ({"is_success": False, "success": True}, 0.0),
+        ({"is_success": np.nan, "success": None}, None),
+        (None, None),
+    ],
+)
+def test_the_success_is_the_first_number_of_its_two_names(info, expected):
+    assert measure_of(info, "success") == expected
 
 
 @pytest.mark.parametrize("name", ["step", "kind", "return", "length", "mean", "sem", "seeds", "seeds_height"])

@@ -261,6 +261,34 @@ def test_a_training_goes_on_from_a_fault(tmp_path, episodes):
         assert (steps[0], steps[-1]) == ((26, 40) if episodes == 2 else (40, 40))
 
 
+class Huge(Fine):
+    """Its 27th step in all returns one huge number, in a range without bounds."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
+    steps = 0
+
+    def __init__(self, part):
+        self.part = part
+
+    def step(self, action):
+        self.steps += 1
+        result = list(super().step(action))
+        if self.steps == 27:
+            result[self.part] = result[self.part] * 0 - 1e25
+        return tuple(result)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("part", "phrase"), [(0, r"entry 0 of the observation is -9\.99"), (1, "the reward is -1e")])
+def test_a_training_goes_on_from_one_huge_number(tmp_path, part, phrase):
+    agent = agents.make("sac-mlp", **SHARED, **SMALL["sac-mlp"])
+    with pytest.raises(UserError, match=rf"robot \(seed 5, step 27\): {phrase}"):
+        train(agent, GymnasiumTask(Huge, "robot", {"part": part}), tmp_path / "run", **few(seeds=1))
+    run = resume(tmp_path / "run", task=GymnasiumTask(Fine, "robot"))
+    assert [row["step"] for row in run.rows(5, "evaluation")] == [20, 40]
+    assert not run.has_diverged(5)
+
+
 class Wider(Fine):
     """The same with other bounds of the action."""
 

@@ -23,13 +23,13 @@ from beliefrl.runs.best import evaluations
 from beliefrl.runs.checkpoint import Checkpoints, _sha256, _signed, listed
 from beliefrl.runs.recorder import Recorder
 from beliefrl.runs.run import Run
-from beliefrl.tasks import make
+from beliefrl.tasks import make, seen_environment
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import session
 from beliefrl.training.schedule import Phase
 from beliefrl.training.stop import Stopped
 from worlds import Counting, CountingAgent, saved
-from wrong import Fine, Raising
+from wrong import Endless, Fine, Raising
 
 SIZES = {"policy_layers": (8,), "value_layers": (8,), "batch_size": 8, "standardise": True}
 AGENT = agents.make("sac-mlp", step_start_rl=20, pretrain_updates=150, **SIZES)
@@ -239,6 +239,35 @@ def test_a_task_of_ones_own_goes_on_with_other_arguments(tmp_path):
     assert resume(run, steps=80, task=GymnasiumTask(Fine, arguments={"port": 5})).options.steps == 80
     with pytest.raises(UserError, match=r"was trained with task=Fine, not .*Other: give that task"):
         resume(run, steps=100, task=Other)
+
+
+def test_a_class_of_environments_has_the_time_limit_of_the_training(tmp_path):
+    run = train(AGENT, GymnasiumTask(Endless, max_steps=10), tmp_path / "run", **OPTIONS | {"steps": 60})
+    for mode in ("sampled", "mode"):
+        assert evaluate(run, 2, task=Endless, progress=False)[mode]["lengths"] == [[10, 10]] * 2
+    resume(run, steps=120, task=Endless)
+    assert [row["length"] for row in run.rows(0, "episode")] == [10] * 12
+
+
+def test_the_recorded_time_limit_is_that_of_the_training(tmp_path):
+    options = OPTIONS | {"steps": 20}
+    run = train(AGENT, GymnasiumTask(Endless, max_steps=10), tmp_path / "run", **options)
+    for task, limit in ((GymnasiumTask(Endless, max_steps=30), "30"), (Endless, "None")):
+        with pytest.raises(UserError, match=f"was trained with max_steps=10, not {limit}: choose another --out"):
+            train(AGENT, task, run.folder, resume=True, **options)
+    run = resume(run, steps=80, task=GymnasiumTask(Endless, max_steps=30))
+    assert run.config["max_steps"] == 30
+    assert [row["length"] for row in run.rows(0, "episode")] == [10, 10, 30, 30]
+
+
+def test_episodes_that_never_ended_may_get_a_time_limit(tmp_path, monkeypatch):
+    """As the error tells them to."""
+    monkeypatch.setattr(seen_environment, "ENDLESS", 25)
+    with pytest.raises(UserError, match="the episode has not ended after 25 steps"):
+        train(AGENT, Endless, tmp_path / "run", **OPTIONS)
+    task = GymnasiumTask(Endless, max_steps=10)
+    run = train(AGENT, task, tmp_path / "run", resume=True, **OPTIONS)
+    assert run.config["max_steps"] == 10
 
 
 @pytest.mark.slow

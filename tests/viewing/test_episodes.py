@@ -4,12 +4,14 @@ import json
 
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import RenderCollection
 
 import beliefrl
-from beliefrl import UserError, evaluate, load, make_env, make_task
+from beliefrl import UserError, evaluate, load, make_env, make_task, with_faults
 from beliefrl.cli import main
 from beliefrl.tasks.gymnasium import GymnasiumTask
-from worlds import saved
+from worlds import Counter, saved
 from wrong import Fine
 
 
@@ -40,6 +42,30 @@ def test_an_environment_of_gymnasium_shows_what_the_agent_sees(tmp_path):
     assert length(make_env(task), policy) == 10
     assert np.array_equal(make_env(task).action_space.high, [1.0])
     assert make_env("gym:Pendulum-v1").observation_space.shape == (3,)
+
+
+@pytest.mark.parametrize("faults", [None, {"noise": 0.1, "flicker_flag": True}])
+@pytest.mark.filterwarnings("ignore:.*A Box observation space")
+def test_it_is_a_complete_environment_of_gymnasium(faults):
+    def made(**arguments):
+        return make_env(make_task("gym:Pendulum-v1", faults=faults, **arguments))
+
+    check_env(made(), skip_render_check=True)
+    environment = RenderCollection(made(render_mode="rgb_array"), pop_frames=False)
+    environment.reset(seed=0)
+    environment.step(np.zeros(1, np.float32))
+    assert [frame.ndim for frame in environment.render()] == [3, 3]
+    assert environment.metadata["render_fps"] == 30
+
+
+@pytest.mark.parametrize("faults", [None, {"noise": 0.1}])
+def test_a_wrong_action_or_a_step_before_a_reset_is_one_sentence(faults):
+    environment = make_env(with_faults(Counter, faults))
+    with pytest.raises(UserError, match="The environment has no state yet: call reset first"):
+        environment.step(np.zeros(1))
+    environment.reset(seed=0)
+    with pytest.raises(UserError, match=r"The action has the shape \(3,\): it must be \(1,\)\."):
+        environment.step(np.zeros(3))
 
 
 def test_what_no_environment_can_be_made_of_is_one_sentence(tmp_path):

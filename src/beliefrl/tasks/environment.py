@@ -123,7 +123,7 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         self._key, state, obs = _reset(self.task, self.np_random.integers(LARGEST))
         self._states = [state]
         self._show()
-        return np.array(obs), {}
+        return np.array(obs, np.float32), {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Apply an action (action,); returns observation (obs,), reward, terminated, truncated (always False), info.
@@ -141,7 +141,7 @@ class TaskEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         obs, reward, terminated, measures = jax.device_get(outcome)
         info = {name: float(value) for name, value in measures.items() if name != "success"}
         info |= {"is_success": bool(measures["success"])} if "success" in measures else {}
-        return np.array(obs), float(reward), bool(terminated), False, info
+        return np.array(obs, np.float32), float(reward), bool(terminated), False, info
 
     def _picture(self) -> Picture:
         if not hasattr(self._drawn, "draw"):

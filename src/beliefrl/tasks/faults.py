@@ -123,11 +123,11 @@ class Faults:
         `waiting` (delay, obs) are the delayed measurements before this step, and `obs` (obs,) is the true observation.
         """
         waiting = xp.concatenate([waiting, obs[None]])
-        seen = waiting[0] + xp.asarray(self.noise, obs.dtype) * draws.noise
+        seen = waiting[0] + xp.asarray(self.noise, draws.noise.dtype) * draws.noise
         lost = draws.whole < self.flicker
         seen = xp.where(lost | (draws.entries < self.dropout), xp.zeros_like(seen), seen)
         if self.flicker_flag:
-            seen = xp.concatenate([seen, xp.asarray(lost, obs.dtype)[None]])
+            seen = xp.concatenate([seen, xp.asarray(lost, seen.dtype)[None]])
         return waiting[1:], seen
 
 

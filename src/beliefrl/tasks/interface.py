@@ -3,6 +3,7 @@
 A run records the interface, and is not opened with another one.
 """
 
+import contextlib
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
@@ -72,10 +73,11 @@ def check_measures(names: Iterable[str], task: str) -> None:
 
 def measure_of(info: Any, name: str) -> float | None:
     """A number in the info of a step, or None. Success may be called `is_success`."""
-    found = info if isinstance(info, dict) else {}
-    value: Any = found.get("is_success", found.get("success")) if name == "success" else found.get(name)
-    try:
-        number = float(np.max(value))
-    except (TypeError, ValueError):
-        return None
-    return number if np.isfinite(number) else None
+    found: dict[str, Any] = info if isinstance(info, dict) else {}
+    for key in ("is_success", "success") if name == "success" else (name,):
+        with contextlib.suppress(TypeError, ValueError):
+            value: Any = found.get(key)
+            number = float(np.max(value))
+            if np.isfinite(number):
+                return number
+    return None

@@ -18,6 +18,7 @@ from beliefrl.tasks.spaces import check_actions, flat_bounds, flat_size, limits,
 from beliefrl.types import as_array, check_indices
 
 _in_use: weakref.WeakValueDictionary[int, Any] = weakref.WeakValueDictionary()  # innermost environments by their id
+HUGE = 1e15  # an observed entry or a reward beyond this: its square, summed over a batch, may not be finite in float32
 ENDLESS = 10_000  # steps after which an episode without a time limit is considered endless
 
 
@@ -31,6 +32,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         """Make the environment and check its spaces."""
         self.task, self.seed = task, seed
         self.steps, self.length = 0, 0  # actions in total, and steps of the environment in this episode
+        self._is_reset = False  # ever
         self._measured: dict[str, float] = {}  # in this episode
         self._bare: Any = None  # the innermost environment, while it is in use
         self.inner = task.bare()
@@ -68,6 +70,9 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         self._lowest, self._highest = limits(self.inner_observation_space, self.indices)
         self.observation_space = spaces.Box(-np.inf, np.inf, (self.indices.size,), np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (self.inner_action_space.low.size,), np.float32)
+        self.render_mode = getattr(self.inner, "render_mode", None)  # an environment may lack both
+        metadata = getattr(self.inner, "metadata", None)
+        self.metadata = metadata if isinstance(metadata, dict) else {}
         self._longest = task.max_steps or _time_limit(self.inner)  # of its own steps
         self.limit = self._longest and actions(self._longest, task.steps_per_action)  # of the agent's
 
@@ -75,14 +80,27 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode."""
-        self.length, self._measured = 0, {}
+        super().reset(seed=seed)
+        self.length, self._measured, self._is_reset = 0, {}, True
         result = self._call("reset", lambda: self.inner.reset(seed=seed, **({"options": options} if options else {})))
         if not (isinstance(result, tuple) and len(result) == 2):
             raise self._fault("reset did not return (observation, info)")
-        return self._seen(result[0]), {}
+        obs, _ = self._seen(result[0]), self._measures(result[1], False)
+        return obs, {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Apply an action in [-1, 1]."""
+        """Apply an action (action,) in [-1, 1].
+
+        Raises:
+            UserError: the action has the wrong shape, `reset` has not been called, or the environment misbehaves.
+        """
+        if np.shape(action) != self.action_space.shape:
+            raise UserError(f"The action has the shape {np.shape(action)}: it must be {self.action_space.shape}.")
+        if not self._is_reset:
+            raise UserError("The environment has no state yet: call reset first.")
+        return self._apply(action)
+
+    def _apply(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         self.steps, scaled = self.steps + 1, scale(self.inner_action_space, action)
         obs, total, terminated, truncated, info = self._step(scaled.copy())  # the environment may change its array
         for _ in range(self.task.steps_per_action - 1):
@@ -160,9 +178,13 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         self.whole = value.reshape(-1)
         with np.errstate(over="ignore"):
             flat = self.whole[self.indices].astype(np.float32)
-        if not np.isfinite(flat).all():
-            entry = int(self.indices[~np.isfinite(flat)][0])
-            raise self._fault(f"entry {entry} of the observation{self._named(entry)} is {self.whole[entry]}")
+        fits = np.abs(flat) <= HUGE  # NaN does not
+        if not fits.all():
+            entry = int(self.indices[~fits][0])
+            raise self._fault(
+                f"entry {entry} of the observation{self._named(entry)} is {self.whole[entry]}, but must be a number "
+                f"from -{HUGE:g} to {HUGE:g}"
+            )
         far = (flat < self._lowest) | (flat > self._highest)
         if far.any():
             entry = int(self.indices[far][0])
@@ -193,9 +215,8 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         if value.shape != () or value.dtype.kind not in "biuf":
             shown = f"of shape {value.shape}" if value.shape else repr(reward)
             raise self._fault(f"the reward is {shown}, but must be one number")
-        with np.errstate(over="ignore"):
-            if not np.isfinite(value.astype(np.float32)):
-                raise self._fault(f"the reward is {value}")
+        if not abs(float(value)) <= HUGE:
+            raise self._fault(f"the reward is {value}, but must be a number from -{HUGE:g} to {HUGE:g}")
         return float(value)
 
     def _flag(self, value: Any, name: str) -> bool:
@@ -242,11 +263,11 @@ class FaultyEnvironment(Environment):
         self._action = np.zeros(self.inner_action_space.low.size, np.float32)
         return self._observed(obs, self._draws()), info
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Apply an action in [-1, 1], or the previous one again."""
+    def _apply(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Apply an action, or the previous one again."""
         draws = self._draws()
         self._action = self._faults.applied(np, action, self._action, draws)
-        obs, reward, terminated, truncated, info = super().step(self._action)
+        obs, reward, terminated, truncated, info = super()._apply(self._action)
         return self._observed(obs, draws), reward, terminated, truncated, info
 
     def _observed(self, obs: np.ndarray, draws: Draws) -> np.ndarray:

@@ -12,7 +12,7 @@ from beliefrl.runs.records import steps_per_action
 from beliefrl.runs.run import Run
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.traced import check_traced
-from beliefrl.types import plain
+from beliefrl.types import LARGEST, plain
 
 RECORDING = ("processes", "checkpoint_steps", "checkpoint_minutes", "keep_checkpoints", "track")
 CHANGEABLE = ("steps", "stop_at", "stop_patience", "step_timeout", *RECORDING)  # may differ when a training continues
@@ -66,6 +66,8 @@ def same(run: Run, config: dict[str, Any], older: dict[str, Any]) -> None:
     asked, before = plain([asked, before | older])  # tuples are lists in the run's config
     there = before | run.config | run.config["options"] | run.config["hyperparameters"]
     there |= {name: asked[name] for name in CHANGEABLE}
+    asked["max_steps"] = time_limit(config)
+    there["max_steps"] = time_limit(run.config) or asked["max_steps"]  # episodes that never ended need one
     for name, value in asked.items():
         if there.get(name, value) != value:
             raise UserError(
@@ -87,6 +89,12 @@ def same_task(run: Run, task: Any) -> None:
             ours, theirs = (each.rpartition(":")[2] for each in (ours, theirs))
         if ours != theirs:
             raise UserError(f"{run.shown} was trained with {name}={there[name]}, not {asked[name]}: give that task.")
+
+
+def time_limit(config: dict[str, Any]) -> int | None:
+    """The time limit of a Gymnasium environment that a run's config records, in steps of the agent, if it has one."""
+    limit = config.get("max_steps", LARGEST)
+    return None if limit == LARGEST else limit
 
 
 def about_task(config: dict[str, Any]) -> dict[str, Any]:

@@ -4,6 +4,7 @@ A run's folder is data: a class of a user that only the folder names is never im
 """
 
 import contextlib
+import dataclasses
 import os
 import shlex
 from collections.abc import Iterator
@@ -22,7 +23,7 @@ from beliefrl.tasks import Task
 from beliefrl.tasks.faults import Faults
 from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.tasks.interface import Interface
-from beliefrl.training.checks import about_task
+from beliefrl.training.checks import about_task, time_limit
 from beliefrl.types import LARGEST, Spec, tuples
 
 
@@ -161,7 +162,8 @@ def task_of(run: Run | str | os.PathLike[str], task: Task | GymnasiumTask | type
 
     Args:
         run: a run, or its folder.
-        task: the task that is returned instead, or the class of its environments.
+        task: the task that is returned instead, or the class of its environments. A class gets the time limit of the
+            training.
 
     Raises:
         UserError: there is no such run, one of its constants is impossible, it was trained on a task of your own, which
@@ -179,7 +181,7 @@ def task_of(run: Run | str | os.PathLike[str], task: Task | GymnasiumTask | type
         if now != before:
             given = f"and the given task has {now}: give the same (beliefrl.with_action_repeat)."
             raise UserError(f"{run.shown} was trained with steps_per_action={before}, {given}")
-        return made
+        return dataclasses.replace(made, max_steps=time_limit(run.config)) if isinstance(task, type) else made
     name, constants = run.config["task"], tuples(run.config["constants"])
     if not tasks.knows(name):
         raise UserError(

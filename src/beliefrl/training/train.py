@@ -50,8 +50,9 @@ def train(
         progress: show the progress: live in a terminal, live with the learning curve in a notebook, elsewhere a line
             for each phase and each evaluation, and at least one per minute. False shows nothing.
         resume: continue the training in `out`, if there is one already. It must have been started with the same
-            agent, task and options. `steps` may be larger. These may be different, and are then changed: stop_at,
-            stop_patience, step_timeout, processes, checkpoint_steps, checkpoint_minutes, keep_checkpoints and track.
+            agent, task (with its time limit, if it had one) and options. `steps` may be larger. These may be different,
+            and are then changed: stop_at, stop_patience, step_timeout, processes, checkpoint_steps,
+            checkpoint_minutes, keep_checkpoints and track.
         options: the fields of `Options`: steps, seeds, seed, envs, overlap, share_env, eval_every,
             eval_episodes, stop_at, stop_patience, init_from, init_best, init_replay, replay_capacity, processes,
             step_timeout, checkpoint_steps, checkpoint_minutes, keep_checkpoints, precision, track. init_from may be a
@@ -121,7 +122,8 @@ def resume(
     Args:
         run: a run, or its folder.
         steps: the total number of environment steps; None: as many as before. It cannot be reduced.
-        task: needed only if the run was trained on a task of your own: that task, or the class of its environments.
+        task: needed only if the run was trained on a task of your own: that task, or the class of its environments,
+            which then have the time limit of the training.
         callback, own_process, progress: as in `train`.
         agent: needed only if an agent of your own was trained: its class, or an instance.
         stop_at: the option `stop_at` from now on; None: train for all steps; "same": as before. A training that has
@@ -185,7 +187,9 @@ def _go_on(
         checks.higher(recorder, options)
         _ = capacity(made_by, options)  # raise before the run's config changes
         checks.possible(options, made, own_process)
-        recorder.amend({"options": dataclasses.asdict(options)}, provenance())
+        amended: dict[str, Any] = {"options": dataclasses.asdict(options)}
+        amended |= {"max_steps": made.spec.max_steps} if isinstance(made, GymnasiumTask) else {}  # it may be another
+        recorder.amend(amended, provenance())
         listen = showing.enter_context(_reporting(recorder, callback, progress))
         training = Session(recorder, made_by, made, options, listen, own_process)
         stack.pop_all()
