@@ -106,6 +106,15 @@ def test_everything_that_is_known_of_a_run_is_shown(folder, capsys):
     assert out.splitlines()[-1] == f"damaged: Line 5 of {folder.name}/metrics/seed-0.jsonl is damaged and left out."
 
 
+def test_results_that_are_older_than_the_log_are_said_to_be_so(folder, capsys):
+    """The training still runs, or was killed."""
+    run = a_folder(folder, [flat(-300.0, -200.0), flat(-300.0, -200.0)], steps=100)
+    (run / "results.json").write_text(json.dumps(RESULTS | {"step": 10}))
+    main(["show", folder.name])
+    command = f"`beliefrl figure table '{folder.name}' --unfinished`"
+    assert f"the log has a later evaluation, of step 20: {command} shows it" in capsys.readouterr().out
+
+
 def test_of_a_run_that_has_only_begun_little_is_shown(folder, capsys):
     a_folder(folder, [[]], steps=100, updates=[], initial={"run": "runs/first", "agent": "vrm", "task": "pendulum"})
     main(["show", folder.name])
@@ -116,5 +125,6 @@ def test_of_a_run_that_has_only_begun_little_is_shown(folder, capsys):
     assert shown["checkpoints"] == "none"
     assert shown["initial networks"] == "last agent of runs/first (vrm on pendulum), commit None"
     assert "best agent" not in shown
+    assert "a later evaluation" not in out
     assert "diverged" not in out
     assert "damaged" not in out

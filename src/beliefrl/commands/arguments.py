@@ -198,7 +198,7 @@ def _refuse_repeated(lists: Collection[str], argv: Sequence[str]) -> None:
 
 def refuse_empty(argv: Sequence[str], *options: str) -> None:
     """Raise a UserError if one of these options is given without a value, for example an empty variable of a shell."""
-    for option, after in zip(argv, [*argv[1:], "--"], strict=True):
+    for option, after in zip(argv, [*argv[1:], "--"], strict=False):
         if option in options and after.startswith("--"):
             raise UserError(f"{option} needs a value: give one, or leave the option out.")
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from beliefrl.commands.arguments import Out, RunFolders, parse
+from beliefrl.commands.arguments import Out, RunFolders, parse, refuse_empty
 from beliefrl.errors import UserError
 
 KINDS = ("curves", "run", "ablation", "sensitivity", "elbo", "aggregate", "scalability", "table")
@@ -61,6 +61,7 @@ def figure(argv: Sequence[str]) -> None:
         raise UserError(f"{given}: write beliefrl figure KIND RUNS, where KIND is {', '.join(KINDS)}.")
     kind = argv[0]
     options = parse(FigureOptions, argv[1:], f"beliefrl figure {kind}")
+    refuse_empty(argv, "--tasks", "--agents", "--names")
     runs, notes = _runs(options, kind)
     out = options.out or pathlib.Path(kind)
     path, more = _draw(kind, runs, out, options.actions)

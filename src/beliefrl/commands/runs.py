@@ -4,13 +4,23 @@ import contextlib
 import dataclasses
 import json
 import pathlib
+import shlex
 import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from beliefrl.commands.arguments import Best, OwnAgent, RunFolder, Seed, named_values, own_agent, parse
+from beliefrl.commands.arguments import (
+    Best,
+    OwnAgent,
+    RunFolder,
+    Seed,
+    named_values,
+    own_agent,
+    parse,
+    refuse_empty,
+)
 from beliefrl.errors import UserError, one_line
 
 if TYPE_CHECKING:
@@ -77,6 +87,10 @@ def show(argv: Sequence[str]) -> None:
             notes.append(str(error))
     table, results = run_table(run, agent), run.results()
     console.print(table)
+    last = max((row["step"] for seed in run.seeds for row in run.rows(seed, "evaluation")), default=0)
+    if last > ((results or {}).get("step") or 0):  # it still trains, or was killed
+        command = f"`beliefrl figure table {shlex.quote(run.shown)} --unfinished`"
+        notes.append(f"the log has a later evaluation, of step {last:,}: {command} shows it")
     if results:
         console.print(results_table(results, run.seeds, f"after {results['step']:,} steps"))
     for note in notes:
@@ -86,6 +100,7 @@ def show(argv: Sequence[str]) -> None:
 def evaluate(argv: Sequence[str]) -> None:
     """`beliefrl evaluate RUN ...`."""
     options = parse(EvaluateOptions, argv, "beliefrl evaluate")
+    refuse_empty(argv, "--constants", "--faults")
     from rich.console import Console
 
     from beliefrl.runs.run import Run

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from beliefrl.commands.arguments import named_values, parse, value_lists
+from beliefrl.commands.arguments import named_values, parse, refuse_empty, value_lists
 from beliefrl.errors import UserError
 
 
@@ -59,6 +59,7 @@ class SweepOptions:
 def sweep(argv: Sequence[str]) -> None:
     """`beliefrl sweep ...`."""
     options = parse(SweepOptions, argv, "beliefrl sweep")
+    refuse_empty(argv, "--agents", "--tasks", "--set", "--observe", "--constants")
     from beliefrl.sweeps.run import sweep as run_sweep
 
     experiments = _experiments(options)

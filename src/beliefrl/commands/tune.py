@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from beliefrl import catalogue
-from beliefrl.commands.arguments import named_values, parse, value_lists
+from beliefrl.commands.arguments import named_values, parse, refuse_empty, value_lists
 from beliefrl.errors import UserError
 
 SHOWN = 5  # of the best trials
@@ -65,6 +65,7 @@ class TuneOptions:
 def tune(argv: Sequence[str]) -> None:
     """`beliefrl tune AGENT TASK ...`."""
     options = parse(TuneOptions, argv, "beliefrl tune")
+    refuse_empty(argv, "--range", "--only", "--set", "--observe", "--constants")
     catalogue.check_agent(options.agent)  # before JAX is imported
     from rich.console import Console
 

@@ -102,7 +102,7 @@ class Session:
                     for event in events:
                         if self.was_finished or self._listen(event):
                             break
-                except Stopped:
+                except (Stopped, UserError):  # a signal, or an environment that fails
                     with contextlib.suppress(OSError, UserError):  # the checkpoint is there
                         self._finish()
                     raise
