@@ -47,6 +47,19 @@ def test_a_figure_is_one_command(runs, capsys, kind):
     assert (runs.parent / f"{kind}.pdf").exists()
 
 
+def test_a_run_that_has_not_begun_does_not_hide_the_others_of_its_group(runs, drawn, capsys):
+    a_run(runs / "done", [flat(1.0, 2.0)])
+    a_run(runs / "begun", [[]], first=1, steps=20)
+    for options in ([], ["--unfinished"]):
+        main(["figure", "curves", "runs", *options])
+        assert "left out: runs/begun has no evaluation of every seed yet" in capsys.readouterr().out.splitlines()
+        assert lines(drawn.pop().axes[0]) == {"vrm": [1.0, 2.0]}
+    with pytest.raises(SystemExit):
+        main(["figure", "curves", "runs", "--names", "begun"])
+    message = "None of the 2 runs is both selected and evaluated with every seed: select others."
+    assert message in capsys.readouterr().err
+
+
 def test_the_cost_table_is_printed_and_written(runs, capsys):
     a_run(runs / "done", [flat(1.0, 2.0)])
     main(["figure", "scalability", "runs"])

@@ -83,6 +83,12 @@ def test_unfinished_runs_are_listed_and_count_when_asked(tmp_path):
     assert {group["label"]: group["unfinished"] for group in with_them} == {"vrm": False, "slac": True}
 
 
+def test_a_seed_that_diverged_before_its_first_evaluation_does_not_hide_an_unfinished_run(tmp_path):
+    a_folder(tmp_path / "going", [TWO_SEEDS[0][:1], []], diverged=[1])
+    (group,) = page_data(tmp_path, unfinished=True)["groups"]
+    assert group["curves"]["sampled"]["seeds"] == [[1.5], [None]]
+
+
 def test_no_finished_run_makes_a_page_too(tmp_path):
     a_folder(tmp_path / "begun", [[]])
     assert page_data(tmp_path)["groups"] == []

@@ -170,6 +170,11 @@ def is_finished(run: Run) -> bool:
     return all(run.has_diverged(seed) or last_step(run, seed) >= run.options.steps for seed in run.seeds)
 
 
+def has_begun(run: Run) -> bool:
+    """Whether every seed has been evaluated, or has diverged."""
+    return all(last_step(run, seed) > 0 or run.has_diverged(seed) for seed in run.seeds)
+
+
 def _has_stopped(run: Run) -> bool:
     return run.reached(run.options.stop_at, run.options.stop_patience)
 

@@ -106,14 +106,18 @@ def _runs(options: FigureOptions, kind: str) -> tuple[list[Any], list[str]]:
         raise UserError("RUNS is missing: give runs, folders that contain runs, or files of results.")
     found = groups.find(options.runs)
     chosen = [run for run in found.runs if _is_chosen(run, options, kind)]
-    drawn = [run for run in chosen if options.unfinished or groups.is_finished(run)]
+    begun = [run for run in chosen if groups.has_begun(run)]
+    drawn = begun if options.unfinished else [run for run in begun if groups.is_finished(run)]
     if not drawn:
-        raise UserError(
-            f"None of the {len(found.runs)} runs is both selected and finished: select others, or add --unfinished."
-        )
+        needed, advice = ("finished", ", or add --unfinished") if begun else ("evaluated with every seed", "")
+        raise UserError(f"None of the {len(found.runs)} runs is both selected and {needed}: select others{advice}.")
     notes = [f"damaged: {why}" for why in found.damage]
-    notes += [f"left out: {run.shown} is not finished (--unfinished includes it)" for run in chosen if run not in drawn]
+    notes += [f"left out: {run.shown} {_why_not(run in begun)}" for run in chosen if run not in drawn]
     return drawn if options.until is None else [results.cut(run, options.until) for run in drawn], notes
+
+
+def _why_not(has_begun: bool) -> str:
+    return "is not finished (--unfinished includes it)" if has_begun else "has no evaluation of every seed yet"
 
 
 def _is_chosen(run: Any, options: FigureOptions, kind: str) -> bool:

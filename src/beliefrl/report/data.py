@@ -12,7 +12,7 @@ import numpy as np
 
 from beliefrl import agents
 from beliefrl.analysis.figures import standard_error
-from beliefrl.analysis.groups import Curve, Group, groups, is_finished, last_step, shortened_by, task_label
+from beliefrl.analysis.groups import Curve, Group, groups, has_begun, is_finished, last_step, shortened_by, task_label
 from beliefrl.analysis.panels import colours, dashes
 from beliefrl.analysis.results import changed
 from beliefrl.analysis.tables import wall_clock
@@ -29,9 +29,9 @@ def page_data(runs: Sequence[Run], page_folder: pathlib.Path, unfinished: bool =
     """Everything that the page shows about `runs`; paths of files are relative to the folder `page_folder`.
 
     Curves and final returns include finished runs only. With `unfinished` they also include runs in which each seed has
-    an evaluation; the curve of a group then ends at the last step that all its seeds have reached.
+    an evaluation or has diverged; the curve of a group then ends at the last step that all its seeds have reached.
     """
-    counted = [run for run in runs if is_finished(run) or (unfinished and _has_begun(run))]
+    counted = [run for run in runs if is_finished(run) or (unfinished and has_begun(run))]
     grouped = groups(counted, agents.defaults(), agents.before())
     lines = [group for group in grouped if not group.why_no_curve]
     group_of = {(run.folder, seed): index for index, group in enumerate(lines) for run, seed in group.seeds}
@@ -53,10 +53,6 @@ def page_data(runs: Sequence[Run], page_folder: pathlib.Path, unfinished: bool =
             for run in runs
         ],
     }
-
-
-def _has_begun(run: Run) -> bool:
-    return all(last_step(run, seed) > 0 for seed in run.seeds)
 
 
 def _group(group: Group) -> dict[str, Any]:
