@@ -190,6 +190,20 @@ def test_videos_and_curves_are_linked_from_where_the_page_lies(tmp_path):
     assert addresses == [f"../runs/a%20run/{name}" for name in ("curve.png", "videos/seed%200.mp4", "x.gif")]
 
 
+def test_a_page_is_written_while_a_training_removes_its_checkpoints(tmp_path, monkeypatch):
+    run = a_folder(tmp_path / "run", TWO_SEEDS)
+    (run / "checkpoints" / "000001").mkdir(parents=True)
+    scandir = os.scandir
+
+    def removed(path="."):
+        if "checkpoints" in os.fspath(path):
+            raise FileNotFoundError(2, "No such file or directory", path)
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", removed)
+    assert len(page_data(tmp_path)["runs"]) == 1
+
+
 def test_action_repeat_is_named_wherever_the_task_is(tmp_path):
     a_folder(tmp_path / "run", TWO_SEEDS, constants={"steps_per_action": 2})
     page = page_data(tmp_path)

@@ -151,7 +151,12 @@ def _session(session: dict[str, Any]) -> dict[str, str]:
 
 
 def _media(folder: pathlib.Path) -> list[pathlib.Path]:
-    return sorted(path for path in folder.rglob("*") if path.suffix in MEDIA or path == folder / PICTURE)
+    """The videos and the curve in a run's folder. Its checkpoints are not read, since a training may remove them."""
+    found = []
+    for inside, folders, names in os.walk(folder):  # unlike `rglob`, it passes over folders that are removed meanwhile
+        folders[:] = [name for name in folders if name != "checkpoints"]
+        found += [pathlib.Path(inside, name) for name in names]
+    return sorted(path for path in found if path.suffix in MEDIA or path == folder / PICTURE)
 
 
 def _link(folder: pathlib.Path, path: pathlib.Path) -> dict[str, str]:
