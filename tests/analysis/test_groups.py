@@ -17,7 +17,8 @@ from beliefrl.analysis.aggregate import (
     profile,
     scores,
 )
-from beliefrl.analysis.groups import find, groups, is_finished, last_step, left_out, task_label
+from beliefrl.analysis.groups import find, groups, is_finished, last_step, left_out
+from beliefrl.analysis.labels import task_label
 from beliefrl.analysis.results import cut
 from beliefrl.errors import UserError
 from beliefrl.runs.run import Run

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from beliefrl.analysis.groups import Group, task_label
+from beliefrl.analysis.groups import Group
+from beliefrl.analysis.labels import task_label
 from beliefrl.errors import UserError
 from beliefrl.runs.given_files import check_folder, write_given
 from beliefrl.runs.run import Run

@@ -9,10 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from beliefrl.analysis import results
-from beliefrl.catalogue import usual_constants
+from beliefrl.analysis.labels import differences, options, task_label
 from beliefrl.errors import UserError
 from beliefrl.runs.given_files import as_path
-from beliefrl.runs.options import Options
 from beliefrl.runs.records import finite_mean, steps_per_action
 from beliefrl.runs.run import Row, Run
 
@@ -204,9 +203,9 @@ def groups(
     for run in runs:
         same_agent = [settings[other.folder] for other in runs if other.config["agent"] == run.config["agent"]]
         same_task = [other.config["constants"] for other in runs if names[other.folder] == names[run.folder]]
-        task = " ".join([names[run.folder], *_differences(run.config["constants"], same_task)])
+        task = " ".join([names[run.folder], *differences(run.config["constants"], same_task)])
         own = results.changed(settings[run.folder], usual[run.config["agent"]])
-        label = " ".join([run.config["agent"], *_differences(own, same_agent), *_options(run)])
+        label = " ".join([run.config["agent"], *differences(own, same_agent), *options(run)])
         of = seeds.setdefault((task, label), {})
         for seed in run.seeds:
             if seed not in of or _precedence(run, seed) > _precedence(of[seed], seed):
@@ -214,19 +213,6 @@ def groups(
     tasks, labels = ([*dict.fromkeys(each)] for each in zip(*seeds, strict=True)) if seeds else ([], [])
     merged = [Group(*each, [(of[seed], seed) for seed in sorted(of)]) for each, of in seeds.items()]
     return sorted(merged, key=lambda group: (tasks.index(group.task), labels.index(group.label)))
-
-
-# Options that can change a return.
-OPTIONS = (
-    *("envs", "overlap", "share_env", "init_from", "init_best", "init_replay", "precision", "replay_capacity"),
-    *("stop_at", "stop_patience"),
-)
-
-
-def _options(run: Run) -> list[str]:
-    """NAME=VALUE of these options, if they differ from their defaults."""
-    given = {name: value for name, value in run.config["options"].items() if name in OPTIONS}
-    return [f"{name}={value}" for name, value in given.items() if value != getattr(Options, name)]
 
 
 def left_out(runs: Sequence[Run], shown: Sequence[Group]) -> list[str]:
@@ -264,23 +250,3 @@ def shortened_by(group: Group) -> str | None:
 
 def _precedence(run: Run, seed: int) -> tuple[int, str]:
     return last_step(run, seed), str(run.config.get("started", ""))
-
-
-def task_label(run: Run) -> str:
-    """The name of a task in figures, with selected entries, faults, action repeat and changed constants, if any.
-
-    The default constants of a task of another package are not known, so they do not count as changed.
-    """
-    seen = run.config.get("observe")
-    observed = ["observe", *map(str, seen)] if seen else []
-    faults = [f"{name}={value}" for name, value in run.config.get("faults", {}).items()]
-    constants = run.config["constants"]
-    known = usual_constants(run.config["task"])
-    usual = (constants if known is None else known) | {"steps_per_action": 1, "measures": constants.get("measures")}
-    changed = [f"{name}={value}" for name, value in constants.items() if name not in usual or value != usual[name]]
-    return " ".join([run.config["task"], *observed, *faults, *changed])
-
-
-def _differences(settings: Row, others: Sequence[Row]) -> list[str]:
-    """NAME=VALUE of the settings that differ from some of `others`."""
-    return [f"{name}={value}" for name, value in settings.items() if any(other.get(name) != value for other in others)]

@@ -12,7 +12,8 @@ import numpy as np
 
 from beliefrl import agents
 from beliefrl.analysis.figures import standard_error
-from beliefrl.analysis.groups import Curve, Group, groups, has_begun, is_finished, last_step, shortened_by, task_label
+from beliefrl.analysis.groups import Curve, Group, groups, has_begun, is_finished, last_step, shortened_by
+from beliefrl.analysis.labels import task_label
 from beliefrl.analysis.panels import colours, dashes
 from beliefrl.analysis.results import changed
 from beliefrl.analysis.tables import wall_clock

@@ -1,0 +1,39 @@
+"""Labels in figures: the name of a task or an agent, and the settings in which it differs."""
+
+from collections.abc import Sequence
+
+from beliefrl.catalogue import usual_constants
+from beliefrl.runs.options import Options
+from beliefrl.runs.run import Row, Run
+
+# Options that can change a return.
+OPTIONS = (
+    *("envs", "overlap", "share_env", "init_from", "init_best", "init_replay", "precision", "replay_capacity"),
+    *("stop_at", "stop_patience"),
+)
+
+
+def options(run: Run) -> list[str]:
+    """NAME=VALUE of these options, if they differ from their defaults."""
+    given = {name: value for name, value in run.config["options"].items() if name in OPTIONS}
+    return [f"{name}={value}" for name, value in given.items() if value != getattr(Options, name)]
+
+
+def task_label(run: Run) -> str:
+    """The name of a task in figures, with selected entries, faults, action repeat and changed constants, if any.
+
+    The default constants of a task of another package are not known, so they do not count as changed.
+    """
+    seen = run.config.get("observe")
+    observed = ["observe", *map(str, seen)] if seen else []
+    faults = [f"{name}={value}" for name, value in run.config.get("faults", {}).items()]
+    constants = run.config["constants"]
+    known = usual_constants(run.config["task"])
+    usual = (constants if known is None else known) | {"steps_per_action": 1, "measures": constants.get("measures")}
+    changed = [f"{name}={value}" for name, value in constants.items() if name not in usual or value != usual[name]]
+    return " ".join([run.config["task"], *observed, *faults, *changed])
+
+
+def differences(settings: Row, others: Sequence[Row]) -> list[str]:
+    """NAME=VALUE of the settings that differ from some of `others`."""
+    return [f"{name}={value}" for name, value in settings.items() if any(other.get(name) != value for other in others)]
