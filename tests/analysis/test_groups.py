@@ -123,6 +123,19 @@ def test_action_repeat_is_named_with_the_task_and_its_steps_are_those_of_the_age
     assert [(group.task, group.axis) for group in groups([once, twice])] == [("pendulum-v", "environment steps"), TWICE]
 
 
+def test_runs_with_other_time_limits_are_other_tasks(tmp_path):
+    """The limit of a Gymnasium environment is no constant. Runs before it was recorded are apart, too."""
+    name = "gym:Arm-v0"
+    made = [
+        a_run(tmp_path / str(limit), [flat(1.0)], task=name, max_steps=limit)
+        if limit
+        else a_run(tmp_path / "old", [flat(1.0)], task=name)
+        for limit in (500, 200, None)
+    ]
+    assert [group.task for group in groups(made)] == [f"{name} max_steps=500", f"{name} max_steps=200", name]
+    assert [group.task for group in groups([made[0], made[2]])] == [name]
+
+
 def test_a_seed_run_twice_counts_once_as_far_as_it_went(tmp_path):
     short, long = a_run(tmp_path / "short", [flat(1.0)]), a_run(tmp_path / "long", [flat(1.0, 2.0)])
     for runs in ([short, long], [long, short]):

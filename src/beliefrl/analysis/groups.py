@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from beliefrl.analysis import results
-from beliefrl.analysis.labels import differences, options, task_label
+from beliefrl.analysis.labels import differences, options, task_labels
 from beliefrl.errors import UserError
 from beliefrl.runs.given_files import as_path
 from beliefrl.runs.records import finite_mean, steps_per_action
@@ -199,7 +199,7 @@ def groups(
     filled = {agent: usual[agent] | (before or {}).get(agent, {}) for agent in usual}
     settings = {run.folder: filled[run.config["agent"]] | run.config["hyperparameters"] for run in runs}
     seeds: dict[tuple[str, str], dict[int, Run]] = {}
-    names = {run.folder: task_label(run) for run in runs}
+    names = dict(zip([run.folder for run in runs], task_labels(runs), strict=True))
     for run in runs:
         same_agent = [settings[other.folder] for other in runs if other.config["agent"] == run.config["agent"]]
         same_task = [other.config["constants"] for other in runs if names[other.folder] == names[run.folder]]

@@ -1,5 +1,6 @@
 """Labels in figures: the name of a task or an agent, and the settings in which it differs."""
 
+from collections import Counter
 from collections.abc import Sequence
 
 from beliefrl.catalogue import usual_constants
@@ -32,6 +33,20 @@ def task_label(run: Run) -> str:
     usual = (constants if known is None else known) | {"steps_per_action": 1, "measures": constants.get("measures")}
     changed = [f"{name}={value}" for name, value in constants.items() if name not in usual or value != usual[name]]
     return " ".join([run.config["task"], *observed, *faults, *changed])
+
+
+def task_labels(runs: Sequence[Run]) -> list[str]:
+    """The `task_label` of each run, with the time limit where runs of one task record several.
+
+    Only runs on Gymnasium environments record it besides their constants; older ones have none.
+    """
+    names, limits = [task_label(run) for run in runs], [run.config.get("max_steps") for run in runs]
+    known = {each for each in zip(names, limits, strict=True) if each[1] is not None}
+    of_task = Counter(name for name, _ in known)
+    return [
+        f"{name} max_steps={limit}" if of_task[name] > 1 and limit is not None else name
+        for name, limit in zip(names, limits, strict=True)
+    ]
 
 
 def differences(settings: Row, others: Sequence[Row]) -> list[str]:
