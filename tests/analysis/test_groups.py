@@ -136,6 +136,17 @@ def test_runs_with_other_time_limits_are_other_tasks(tmp_path):
     assert [group.task for group in groups([made[0], made[2]])] == [name]
 
 
+def test_a_function_as_a_setting_is_the_same_in_every_process(tmp_path):
+    made = [
+        a_run(tmp_path / str(n), [flat(1.0)], first=n, agent="own:Agent", settings={"act": f"<function {name}>"})
+        for n, name in enumerate(["tanh at 0x7f57a0", "tanh at 0x000001C2F0", "relu at 0x7f57a0"])
+    ]
+    assert [(group.label, len(group.seeds)) for group in groups(made)] == [
+        ("own:Agent act=<function tanh>", 2),
+        ("own:Agent act=<function relu>", 1),
+    ]
+
+
 def test_a_seed_run_twice_counts_once_as_far_as_it_went(tmp_path):
     short, long = a_run(tmp_path / "short", [flat(1.0)]), a_run(tmp_path / "long", [flat(1.0, 2.0)])
     for runs in ([short, long], [long, short]):

@@ -1,7 +1,9 @@
 """Labels in figures: the name of a task or an agent, and the settings in which it differs."""
 
+import re
 from collections import Counter
 from collections.abc import Sequence
+from typing import Any
 
 from beliefrl.catalogue import usual_constants
 from beliefrl.runs.options import Options
@@ -17,7 +19,7 @@ OPTIONS = (
 def options(run: Run) -> list[str]:
     """NAME=VALUE of these options, if they differ from their defaults."""
     given = {name: value for name, value in run.config["options"].items() if name in OPTIONS}
-    return [f"{name}={value}" for name, value in given.items() if value != getattr(Options, name)]
+    return [f"{name}={as_text(value)}" for name, value in given.items() if value != getattr(Options, name)]
 
 
 def task_label(run: Run) -> str:
@@ -27,11 +29,13 @@ def task_label(run: Run) -> str:
     """
     seen = run.config.get("observe")
     observed = ["observe", *map(str, seen)] if seen else []
-    faults = [f"{name}={value}" for name, value in run.config.get("faults", {}).items()]
+    faults = [f"{name}={as_text(value)}" for name, value in run.config.get("faults", {}).items()]
     constants = run.config["constants"]
     known = usual_constants(run.config["task"])
     usual = (constants if known is None else known) | {"steps_per_action": 1, "measures": constants.get("measures")}
-    changed = [f"{name}={value}" for name, value in constants.items() if name not in usual or value != usual[name]]
+    changed = [
+        f"{name}={as_text(value)}" for name, value in constants.items() if name not in usual or value != usual[name]
+    ]
     return " ".join([run.config["task"], *observed, *faults, *changed])
 
 
@@ -51,4 +55,12 @@ def task_labels(runs: Sequence[Run]) -> list[str]:
 
 def differences(settings: Row, others: Sequence[Row]) -> list[str]:
     """NAME=VALUE of the settings that differ from some of `others`."""
-    return [f"{name}={value}" for name, value in settings.items() if any(other.get(name) != value for other in others)]
+    texts = {name: as_text(value) for name, value in settings.items()}
+    return [
+        f"{name}={text}" for name, text in texts.items() if any(as_text(other.get(name)) != text for other in others)
+    ]
+
+
+def as_text(value: Any) -> str:
+    """A setting as text, without the address of a function, which differs in every process."""
+    return re.sub(" at 0x[0-9a-fA-F]+", "", str(value))

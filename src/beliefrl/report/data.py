@@ -13,7 +13,7 @@ import numpy as np
 from beliefrl import agents
 from beliefrl.analysis.figures import standard_error
 from beliefrl.analysis.groups import Curve, Group, groups, has_begun, is_finished, last_step, shortened_by
-from beliefrl.analysis.labels import task_label
+from beliefrl.analysis.labels import as_text, task_label
 from beliefrl.analysis.panels import colours, dashes
 from beliefrl.analysis.results import changed
 from beliefrl.analysis.tables import wall_clock
@@ -136,7 +136,7 @@ def settings(config: dict[str, Any]) -> list[str] | None:
     if defaults is None:
         return None
     known = agents.before()[config["agent"]] | config["hyperparameters"]
-    return [f"{name}={value}" for name, value in changed(known, defaults).items()]
+    return [f"{name}={as_text(value)}" for name, value in changed(known, defaults).items()]
 
 
 def _session(session: dict[str, Any]) -> dict[str, str]:
