@@ -91,7 +91,7 @@ def test_constants_of_a_task_set_it_apart_from_the_same_task_only(tmp_path):
         a_run(tmp_path / "b", [flat(1.0)], constants={"length": 2.0}),
         a_run(tmp_path / "c", [flat(1.0)], task="cartpole", constants={"track": 2.4}),
     ]
-    assert [group.task for group in groups(made)] == ["pendulum-v", "pendulum-v length=2.0", "cartpole track=2.4"]
+    assert [group.task for group in groups(made)] == ["pendulum-v", "pendulum-v length=2", "cartpole track=2.4"]
 
 
 @pytest.mark.parametrize("name", ["pendulum-v", "cartpole", "cartpole-p", "target-reaching"])
@@ -144,6 +144,35 @@ def test_a_function_as_a_setting_is_the_same_in_every_process(tmp_path):
     assert [(group.label, len(group.seeds)) for group in groups(made)] == [
         ("own:Agent act=<function tanh>", 2),
         ("own:Agent act=<function relu>", 1),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("task", "named"), [("gym:Arm-v0", "gym:Arm-v0 noise=[1] mass=2 span=[1, 2.5]"), ("my-task", "my-task noise=[1]")]
+)
+def test_settings_that_are_written_differently_are_the_same(tmp_path, task, named):
+    ways = [
+        ({"mass": 2, "span": [1, 2.5]}, {"noise": [1]}, 1, {"stop_at": -200, "init_from": "runs/a"}),
+        ({"span": [1.0, 2.5], "mass": 2.0}, {"noise": [1.0]}, 1.0, {"stop_at": -200.0, "init_from": "runs/a/"}),
+    ]
+    made = []
+    for seed, (constants, faults, gamma, options) in enumerate(ways):
+        of = {"task": task, "constants": constants, "faults": faults, "settings": {"gamma": gamma}, "first": seed}
+        made.append(a_run(tmp_path / str(seed), [flat(1.0)], **of))
+        made[-1].config["options"] |= options
+    assert labels(groups(made)) == [(named, "vrm stop_at=-200 init_from=runs/a", [0, 1])]
+
+
+def test_constants_in_another_order_are_the_same(tmp_path):
+    """They differ from those of a third run, so they are named."""
+    first, other = {"mass": 2, "length": 3}, {"mass": 1, "length": 1}
+    made = [
+        a_run(tmp_path / str(seed), [flat(1.0)], task="my-task", constants=dict(constants), first=seed)
+        for seed, constants in enumerate([first.items(), reversed(first.items()), other.items()])
+    ]
+    assert labels(groups(made)) == [
+        ("my-task length=3 mass=2", "vrm", [0, 1]),
+        ("my-task length=1 mass=1", "vrm", [2]),
     ]
 
 

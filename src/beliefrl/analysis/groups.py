@@ -203,7 +203,7 @@ def groups(
     for run in runs:
         same_agent = [settings[other.folder] for other in runs if other.config["agent"] == run.config["agent"]]
         same_task = [other.config["constants"] for other in runs if names[other.folder] == names[run.folder]]
-        task = " ".join([names[run.folder], *differences(run.config["constants"], same_task)])
+        task = " ".join([names[run.folder], *sorted(differences(run.config["constants"], same_task))])
         own = results.changed(settings[run.folder], usual[run.config["agent"]])
         label = " ".join([run.config["agent"], *differences(own, same_agent), *options(run)])
         of = seeds.setdefault((task, label), {})

@@ -1,5 +1,6 @@
 """Labels in figures: the name of a task or an agent, and the settings in which it differs."""
 
+import os
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -19,6 +20,8 @@ OPTIONS = (
 def options(run: Run) -> list[str]:
     """NAME=VALUE of these options, if they differ from their defaults."""
     given = {name: value for name, value in run.config["options"].items() if name in OPTIONS}
+    if given.get("init_from"):
+        given["init_from"] = os.path.normpath(given["init_from"])  # without a slash at its end
     return [f"{name}={as_text(value)}" for name, value in given.items() if value != getattr(Options, name)]
 
 
@@ -34,7 +37,9 @@ def task_label(run: Run) -> str:
     known = usual_constants(run.config["task"])
     usual = (constants if known is None else known) | {"steps_per_action": 1, "measures": constants.get("measures")}
     changed = [
-        f"{name}={as_text(value)}" for name, value in constants.items() if name not in usual or value != usual[name]
+        f"{name}={as_text(value)}"
+        for name, value in sorted(constants.items())
+        if name not in usual or value != usual[name]
     ]
     return " ".join([run.config["task"], *observed, *faults, *changed])
 
@@ -62,5 +67,9 @@ def differences(settings: Row, others: Sequence[Row]) -> list[str]:
 
 
 def as_text(value: Any) -> str:
-    """A setting as text, without the address of a function, which differs in every process."""
-    return re.sub(" at 0x[0-9a-fA-F]+", "", str(value))
+    """A setting as text. Equal numbers have the same text, 2 and 2.0, and a function has no address."""
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(as_text, value))}]"
+    if isinstance(value, float):
+        return str(value).removesuffix(".0")
+    return re.sub(" at 0x[0-9a-fA-F]+", "", str(value))  # it differs in every process
