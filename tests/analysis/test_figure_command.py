@@ -8,6 +8,7 @@ import pytest
 from beliefrl import agents
 from beliefrl.analysis import aggregate, panels
 from beliefrl.cli import main
+from beliefrl.runs.run import Run
 from beliefrl.sweeps import sources
 from inputs import a_run, flat
 
@@ -58,6 +59,16 @@ def test_a_run_that_has_not_begun_does_not_hide_the_others_of_its_group(runs, dr
         main(["figure", "curves", "runs", "--names", "begun"])
     message = "None of the 2 runs is both selected and evaluated with every seed: select others."
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("options", [[], ["--unfinished"]])
+def test_a_figure_reads_a_log_once_so_that_all_of_it_is_of_one_moment_of_a_training(runs, drawn, monkeypatch, options):
+    read = []
+    rows = Run.rows
+    monkeypatch.setattr(Run, "rows", lambda run, seed, kind=None: read.append(seed) or rows(run, seed, kind))
+    a_run(runs / "done", [flat(1.0, 2.0), flat(3.0, 4.0)])
+    main(["figure", "curves", "runs", *options])
+    assert sorted(read) == [0, 1]
 
 
 def test_the_cost_table_is_printed_and_written(runs, capsys):

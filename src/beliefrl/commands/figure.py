@@ -101,10 +101,11 @@ def _draw(kind: str, runs: Sequence[Any], out: pathlib.Path, actions: str) -> tu
 def _runs(options: FigureOptions, kind: str) -> tuple[list[Any], list[str]]:
     """The selected runs, and one sentence for each damaged file and each run that is left out."""
     from beliefrl.analysis import groups, results
+    from beliefrl.runs.cached import CachedRun
 
     if not options.runs:
         raise UserError("RUNS is missing: give runs, folders that contain runs, or files of results.")
-    found = groups.find(options.runs)
+    found = groups.find(options.runs, CachedRun)
     chosen = [run for run in found.runs if _is_chosen(run, options, kind)]
     begun = [run for run in chosen if groups.has_begun(run)]
     drawn = begun if options.unfinished else [run for run in begun if groups.is_finished(run)]
