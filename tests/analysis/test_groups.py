@@ -205,6 +205,13 @@ def test_runs_are_found_however_deep(tmp_path):
     assert len(find([tmp_path / "sweep", tmp_path / "sweep" / "vrm-seed0"]).runs) == 2
 
 
+@pytest.mark.parametrize("name", ["checkpoints", "metrics", "tensorboard", "wandb"])
+def test_a_run_may_have_any_name_but_inside_a_run_there_are_no_others(tmp_path, name):
+    run = a_run(tmp_path / name, [flat(1.0)])
+    a_run(run.folder / "checkpoints" / "copy", [flat(1.0)])
+    assert [run.folder.name for run in find([tmp_path]).runs] == [name]
+
+
 def test_a_run_that_cannot_be_read_is_left_out_and_named(tmp_path):
     good, bad = a_run(tmp_path / "good", [flat(1.0)]).folder, a_run(tmp_path / "bad", [flat(1.0)]).folder
     (bad / "config.json").write_text("{")

@@ -15,6 +15,7 @@ from beliefrl.runs.given_files import as_path
 from beliefrl.runs.records import finite_mean, steps_per_action
 from beliefrl.runs.run import Row, Run
 
+OF_RUN = ("checkpoints", "metrics", "tensorboard", "wandb")  # folders in a run's folder that contain no runs
 RunSeed = tuple[Run, int]  # a run and one of its seed numbers
 
 
@@ -153,7 +154,8 @@ def _folders(path: pathlib.Path) -> Iterator[pathlib.Path]:
         if real in seen:
             inside.clear()  # a link to a folder above
         else:
-            inside[:] = [name for name in inside if name not in ("checkpoints", "metrics", "tensorboard", "wandb")]
+            if os.path.exists(os.path.join(folder, "config.json")):  # noqa: PTH110, PTH118
+                inside[:] = [name for name in inside if name not in OF_RUN]
             seen.add(real)
             yield pathlib.Path(folder)
 
