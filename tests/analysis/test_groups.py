@@ -226,8 +226,9 @@ def test_a_run_that_cannot_be_read_is_left_out_and_named(tmp_path):
 def test_a_run_without_its_logs_is_still_a_run(tmp_path):
     run = a_run(tmp_path / "run", [flat(1.0)])
     shutil.rmtree(run.folder / "metrics")
-    found = find([run.folder])
-    assert len(found.runs) == 1
+    a_run(tmp_path / "other", [flat(1.0)])
+    found = find([tmp_path])
+    assert [run.folder.name for run in found.runs] == ["other", "run"]
     assert "metrics lacks the log of seed 0" in found.damage[0]
 
 

@@ -12,7 +12,7 @@ from beliefrl.analysis import results
 from beliefrl.analysis.labels import differences, options, task_labels
 from beliefrl.errors import UserError
 from beliefrl.runs.given_files import as_path
-from beliefrl.runs.records import finite_mean, steps_per_action
+from beliefrl.runs.records import finite_mean, is_complete, parsed, steps_per_action
 from beliefrl.runs.run import Row, Run
 
 OF_RUN = ("checkpoints", "metrics", "tensorboard", "wandb")  # folders in a run's folder that contain no runs
@@ -161,7 +161,10 @@ def _folders(path: pathlib.Path) -> Iterator[pathlib.Path]:
 
 
 def _is_run(folder: pathlib.Path) -> bool:
-    return os.path.exists(folder / "config.json") and os.path.isdir(folder / "metrics")  # noqa: PTH110, PTH112
+    """Whether there is a config.json of a training; where it is damaged, the folder of the logs tells."""
+    config = folder / "config.json"
+    has_logs = os.path.isdir(folder / "metrics")  # noqa: PTH112 - pathlib's version raises if a name is too long
+    return os.path.exists(config) and (has_logs or is_complete(parsed(config)))  # noqa: PTH110
 
 
 def is_finished(run: Run) -> bool:
