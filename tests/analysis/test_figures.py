@@ -1,5 +1,6 @@
 """Learning curves and tables of a run, and figures of many runs, from files that are written by hand."""
 
+import json
 import math
 import re
 
@@ -454,6 +455,13 @@ def test_the_time_until_an_earlier_step_is_unknown(tmp_path):
     assert wall_clock(run) == wall_clock(cut(run, 20)) == 3600.0
     assert wall_clock(cut(run, 10)) is None
     assert final_rows(groups([cut(run, 10)]))[0][-1] == "unknown"
+
+
+def test_the_time_until_the_last_step_is_known_after_a_long_pre_training(tmp_path):
+    run = a_run(tmp_path / "one", [flat(1.0)], **HOUR)
+    log = run.folder / "metrics" / "seed-0.jsonl"
+    log.write_text(json.dumps({"step": 2000, "kind": "pretrain", "pretrain_loss": 1.0}) + "\n" + log.read_text())
+    assert wall_clock(cut(run, 10)) == 3600.0
 
 
 @pytest.mark.parametrize("name", ["table.v1", "numbers.csv"])
