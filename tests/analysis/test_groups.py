@@ -277,6 +277,15 @@ def test_runs_with_other_options_are_groups_of_their_own_and_a_repetition_is_nam
     assert repeated == f"left out: {tmp_path / 'c'}, seed 0 1: another run has the same settings and seed"
 
 
+def test_a_repetition_that_diverged_is_named_as_such(tmp_path):
+    """The run that went further counts, so a failure would be hidden."""
+    lost = a_run(tmp_path / "a", [flat(1.0), flat(1.0)], diverged=[1])
+    whole = a_run(tmp_path / "b", [flat(1.0, 2.0), flat(1.0, 2.0)])
+    (sentence,) = left_out([lost, whole], groups([lost, whole]))
+    again = f"left out: {lost.folder}, seed 0 1: another run has the same settings and seed"
+    assert sentence == f"{again}. In {lost.folder}, seed 1 diverged"
+
+
 # Aggregates over tasks, against their definitions (Agarwal et al. 2021).
 
 

@@ -225,16 +225,18 @@ def left_out(runs: Sequence[Run], shown: Sequence[Group]) -> list[str]:
     whose curve ends before the last evaluation of its longest seed.
     """
     counted = {(run.folder, seed) for group in shown for run, seed in group.seeds}
-    missing = [(run.shown, [seed for seed in run.seeds if (run.folder, seed) not in counted]) for run in runs]
-    twice = [
-        f"left out: {folder}, seed {' '.join(map(str, seeds))}: another run has the same settings and seed"
-        for folder, seeds in missing
-        if seeds
-    ]
+    missing = [(run, [seed for seed in run.seeds if (run.folder, seed) not in counted]) for run in runs]
+    twice = [_counted_elsewhere(run, seeds) for run, seeds in missing if seeds]
     without = [
         f"left out: {group.label} on {group.task}: {group.why_no_curve}" for group in shown if group.why_no_curve
     ]
     return twice + without + [why for group in shown if (why := shortened_by(group))]
+
+
+def _counted_elsewhere(run: Run, seeds: Sequence[int]) -> str:
+    shown, lost = (" ".join(map(str, some)) for some in (seeds, filter(run.has_diverged, seeds)))
+    also = f". In {run.shown}, seed {lost} diverged" if lost else ""  # the failure is not hidden
+    return f"left out: {run.shown}, seed {shown}: another run has the same settings and seed{also}"
 
 
 def shortened_by(group: Group) -> str | None:
