@@ -144,6 +144,20 @@ def test_a_figure_names_what_it_leaves_out(runs, drawn, capsys):
         assert [line for line in printed if not line.startswith(("|", "written"))] == notes
 
 
+def test_text_of_a_run_sends_nothing_to_the_terminal(runs, drawn, capsys):
+    name = "a\x1b[31mred\nother"
+    a_run(runs / "first", [flat(1.0)], task=name, diverged=[0])
+    log = a_run(runs / "again\x1b[2J", [[]], task=name, agent=name, diverged=[0]).folder / "metrics" / "seed-0.jsonl"
+    log.write_text("scribble\n" + log.read_text())
+    for kind in ("curves", "table"):
+        main(["figure", kind, "runs"])
+        printed = capsys.readouterr().out
+        assert "left out: ared other on ared other: all seeds have diverged" in printed
+        assert "\x1b" not in printed
+    main(["report", "runs"])
+    assert "\x1b" not in capsys.readouterr().out
+
+
 def test_a_report_is_one_command(runs, capsys):
     done = a_run(runs / "done", [flat(1.0, 2.0)])
     log = done.folder / "metrics" / "seed-0.jsonl"

@@ -162,11 +162,11 @@ def test_the_plain_agents_line_is_not_dashed(tmp_path):
     ]
 
 
-def test_settings_are_those_that_differ_from_the_agents(tmp_path):
+def test_settings_are_those_that_differ_from_the_agents_and_all_of_an_own_agent(tmp_path):
     a_folder(tmp_path / "a", TWO_SEEDS, hyperparameters={"gamma": 0.99, "d_size": 7, "policy_layers": [256, 256]})
     a_folder(tmp_path / "b", TWO_SEEDS, agent="vrm-single", hyperparameters={"models": "single"})
     a_folder(tmp_path / "c", TWO_SEEDS, agent="mine:Agent", hyperparameters={"x": 1})
-    assert [run["settings"] for run in page_data(tmp_path)["runs"]] == [["d_size=7"], [], None]
+    assert [run["settings"] for run in page_data(tmp_path)["runs"]] == [["d_size=7"], [], ["x=1"]]
 
 
 def test_a_picture_on_another_drive_has_an_absolute_address(tmp_path, monkeypatch):

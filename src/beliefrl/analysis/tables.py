@@ -15,7 +15,7 @@ from beliefrl.analysis.aggregate import known_bounds
 from beliefrl.analysis.figures import mean_of, standard_error
 from beliefrl.analysis.groups import Curve, Group, last_step
 from beliefrl.analysis.panels import numbers
-from beliefrl.errors import UserError
+from beliefrl.errors import UserError, one_line
 from beliefrl.runs import arrays
 from beliefrl.runs.given_files import check_folder, write_given
 from beliefrl.runs.records import sessions
@@ -74,6 +74,7 @@ def write_table(columns: Sequence[Column], rows: Sequence[Cells], out: pathlib.P
     if not rows:
         raise UserError("The table would be empty: none of these runs has an evaluation there.")
     check_folder(out)
+    rows = [[one_line(cell) for cell in row] for row in rows]  # names in a config.json may have terminal escapes
     write_given(out.with_suffix(".tex"), latex(columns, rows).encode())
     write_given(out.with_suffix(".md"), markdown(columns, rows).encode())
     return out.with_suffix(".md")

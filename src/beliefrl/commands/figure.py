@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from beliefrl.commands.arguments import Out, RunFolders, parse
-from beliefrl.errors import UserError
+from beliefrl.errors import UserError, one_line
 
 KINDS = ("curves", "run", "ablation", "sensitivity", "elbo", "aggregate", "scalability", "table")
 TABLES = ("scalability", "table")
@@ -67,7 +67,7 @@ def figure(argv: Sequence[str]) -> None:
     if kind in TABLES:
         print(path.read_text(encoding="utf-8"), end="")
     for note in notes + more:
-        print(note)
+        print(one_line(note))
     print(f"written to {path} and {path.with_suffix('.tex' if kind in TABLES else '.pdf').name}")
 
 
@@ -150,5 +150,7 @@ def report(argv: Sequence[str]) -> None:
         raise UserError("RUNS is missing: give runs, folders that contain runs, or files of results.")
     from beliefrl.report import write_report
 
-    path = write_report(options.runs, options.out, options.unfinished, lambda sentence: print(f"damaged: {sentence}"))
+    path = write_report(
+        options.runs, options.out, options.unfinished, lambda sentence: print(one_line(f"damaged: {sentence}"))
+    )
     print(f"written to {path}: open it in a browser")

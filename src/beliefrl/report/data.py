@@ -130,12 +130,13 @@ def _run(run: Run, page_folder: pathlib.Path, groups_of: Sequence[int | None]) -
     }
 
 
-def settings(config: dict[str, Any]) -> list[str] | None:
-    """NAME=VALUE of the hyperparameters that differ from the agent's defaults; None if this version lacks the agent."""
-    defaults = agents.defaults().get(config["agent"])
-    if defaults is None:
-        return None
-    known = agents.before()[config["agent"]] | config["hyperparameters"]
+def settings(config: dict[str, Any]) -> list[str]:
+    """NAME=VALUE of the hyperparameters that differ from the agent's defaults; all if no agent of this name is known.
+
+    An own agent is never known, since it would have to be imported.
+    """
+    defaults = agents.defaults().get(config["agent"], {})
+    known = agents.before().get(config["agent"], {}) | config["hyperparameters"]
     return [f"{name}={as_text(value)}" for name, value in changed(known, defaults).items()]
 
 
