@@ -8,6 +8,7 @@ import pytest
 from beliefrl import agents
 from beliefrl.analysis import aggregate, panels
 from beliefrl.cli import main
+from beliefrl.runs.run import Run
 from beliefrl.sweeps import sources
 from inputs import a_run, flat
 
@@ -45,6 +46,29 @@ def test_a_figure_is_one_command(runs, capsys, kind):
     main(["figure", kind, "runs", "--tasks", "pendulum"])
     assert "left out" not in capsys.readouterr().out
     assert (runs.parent / f"{kind}.pdf").exists()
+
+
+def test_a_run_that_has_not_begun_does_not_hide_the_others_of_its_group(runs, drawn, capsys):
+    a_run(runs / "done", [flat(1.0, 2.0)])
+    a_run(runs / "begun", [[]], first=1, steps=20)
+    for options in ([], ["--unfinished"]):
+        main(["figure", "curves", "runs", *options])
+        assert "left out: runs/begun has no evaluation of every seed yet" in capsys.readouterr().out.splitlines()
+        assert lines(drawn.pop().axes[0]) == {"vrm": [1.0, 2.0]}
+    with pytest.raises(SystemExit):
+        main(["figure", "curves", "runs", "--names", "begun"])
+    message = "None of the 2 runs is both selected and evaluated with every seed: select others."
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("options", [[], ["--unfinished"]])
+def test_a_figure_reads_a_log_once_so_that_all_of_it_is_of_one_moment_of_a_training(runs, drawn, monkeypatch, options):
+    read = []
+    rows = Run.rows
+    monkeypatch.setattr(Run, "rows", lambda run, seed, kind=None: read.append(seed) or rows(run, seed, kind))
+    a_run(runs / "done", [flat(1.0, 2.0), flat(3.0, 4.0)])
+    main(["figure", "curves", "runs", *options])
+    assert sorted(read) == [0, 1]
 
 
 def test_the_cost_table_is_printed_and_written(runs, capsys):
@@ -118,6 +142,20 @@ def test_a_figure_names_what_it_leaves_out(runs, drawn, capsys):
         main(["figure", kind, "runs"])
         printed = capsys.readouterr().out.splitlines()
         assert [line for line in printed if not line.startswith(("|", "written"))] == notes
+
+
+def test_text_of_a_run_sends_nothing_to_the_terminal(runs, drawn, capsys):
+    name = "a\x1b[31mred\nother"
+    a_run(runs / "first", [flat(1.0)], task=name, diverged=[0])
+    log = a_run(runs / "again\x1b[2J", [[]], task=name, agent=name, diverged=[0]).folder / "metrics" / "seed-0.jsonl"
+    log.write_text("scribble\n" + log.read_text())
+    for kind in ("curves", "table"):
+        main(["figure", kind, "runs"])
+        printed = capsys.readouterr().out
+        assert "left out: ared other on ared other: all seeds have diverged" in printed
+        assert "\x1b" not in printed
+    main(["report", "runs"])
+    assert "\x1b" not in capsys.readouterr().out
 
 
 def test_a_report_is_one_command(runs, capsys):

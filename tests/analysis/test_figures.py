@@ -1,5 +1,9 @@
 """Learning curves and tables of a run, and figures of many runs, from files that are written by hand."""
 
+import json
+import math
+import re
+
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -141,6 +145,28 @@ def test_a_seed_that_diverged_does_not_count_in_a_row_and_is_named(tmp_path):
     assert row[4:6] == ("960.0 (1 of 2 diverged)", "7.0 (1 of 2 diverged)")
     (row,) = final_rows(groups([a_run(tmp_path / "all", two, task="cartpole", diverged=[0, 1])]))
     assert row[4:6] == ("diverged", "diverged")
+
+
+def test_a_return_that_is_not_finite_does_not_count_in_a_row_and_is_named(tmp_path):
+    seeds = [flat(100, 960), flat(100, math.nan), flat(100, math.inf)]
+    (row,) = final_rows(groups([a_run(tmp_path / "some", seeds, task="cartpole")]))
+    assert row[4:6] == ("960.0 (2 of 3 not finite)", "7.0 ± 0.0")
+    (row,) = final_rows(groups([a_run(tmp_path / "all", seeds[1:], task="cartpole")]))
+    assert row[4] == "- (2 of 2 not finite)"
+    (row,) = final_rows(groups([a_run(tmp_path / "both", seeds[1:], task="cartpole", diverged=[0])]))
+    assert row[4] == "- (1 of 2 diverged) (1 of 2 not finite)"
+
+
+def test_a_measure_that_is_nan_in_all_episodes_has_an_empty_panel(tmp_path, drawn):
+    """Warnings are errors in the tests."""
+    run = a_run(tmp_path / "a", with_success([flat(1.0, 2.0)]))
+    log = run.folder / "metrics" / "seed-0.jsonl"
+    log.write_text(re.sub(r'(_success": )\[[^]]*]', r"\1[NaN]", log.read_text()))
+    panels.draw_curves(groups([run]), tmp_path / "curves")
+    for figure in (curve_figure(run), *drawn):
+        returns, success = figure.axes
+        assert np.isfinite(returns.lines[0].get_ydata()).all()
+        assert np.isnan(success.lines[0].get_ydata()).all()
 
 
 def test_a_measure_that_only_some_runs_have_is_not_in_a_row(tmp_path):
@@ -429,6 +455,13 @@ def test_the_time_until_an_earlier_step_is_unknown(tmp_path):
     assert wall_clock(run) == wall_clock(cut(run, 20)) == 3600.0
     assert wall_clock(cut(run, 10)) is None
     assert final_rows(groups([cut(run, 10)]))[0][-1] == "unknown"
+
+
+def test_the_time_until_the_last_step_is_known_after_a_long_pre_training(tmp_path):
+    run = a_run(tmp_path / "one", [flat(1.0)], **HOUR)
+    log = run.folder / "metrics" / "seed-0.jsonl"
+    log.write_text(json.dumps({"step": 2000, "kind": "pretrain", "pretrain_loss": 1.0}) + "\n" + log.read_text())
+    assert wall_clock(cut(run, 10)) == 3600.0
 
 
 @pytest.mark.parametrize("name", ["table.v1", "numbers.csv"])

@@ -17,7 +17,8 @@ from beliefrl.analysis.aggregate import (
     profile,
     scores,
 )
-from beliefrl.analysis.groups import find, groups, is_finished, last_step, left_out, task_label
+from beliefrl.analysis.groups import find, groups, is_finished, last_step, left_out
+from beliefrl.analysis.labels import task_label
 from beliefrl.analysis.results import cut
 from beliefrl.errors import UserError
 from beliefrl.runs.run import Run
@@ -90,7 +91,7 @@ def test_constants_of_a_task_set_it_apart_from_the_same_task_only(tmp_path):
         a_run(tmp_path / "b", [flat(1.0)], constants={"length": 2.0}),
         a_run(tmp_path / "c", [flat(1.0)], task="cartpole", constants={"track": 2.4}),
     ]
-    assert [group.task for group in groups(made)] == ["pendulum-v", "pendulum-v length=2.0", "cartpole track=2.4"]
+    assert [group.task for group in groups(made)] == ["pendulum-v", "pendulum-v length=2", "cartpole track=2.4"]
 
 
 @pytest.mark.parametrize("name", ["pendulum-v", "cartpole", "cartpole-p", "target-reaching"])
@@ -122,6 +123,59 @@ def test_action_repeat_is_named_with_the_task_and_its_steps_are_those_of_the_age
     assert [(group.task, group.axis) for group in groups([once, twice])] == [("pendulum-v", "environment steps"), TWICE]
 
 
+def test_runs_with_other_time_limits_are_other_tasks(tmp_path):
+    """The limit of a Gymnasium environment is no constant. Runs before it was recorded are apart, too."""
+    name = "gym:Arm-v0"
+    made = [
+        a_run(tmp_path / str(limit), [flat(1.0)], task=name, max_steps=limit)
+        if limit
+        else a_run(tmp_path / "old", [flat(1.0)], task=name)
+        for limit in (500, 200, None)
+    ]
+    assert [group.task for group in groups(made)] == [f"{name} max_steps=500", f"{name} max_steps=200", name]
+    assert [group.task for group in groups([made[0], made[2]])] == [name]
+
+
+def test_a_function_as_a_setting_is_the_same_in_every_process(tmp_path):
+    made = [
+        a_run(tmp_path / str(n), [flat(1.0)], first=n, agent="own:Agent", settings={"act": f"<function {name}>"})
+        for n, name in enumerate(["tanh at 0x7f57a0", "tanh at 0x000001C2F0", "relu at 0x7f57a0"])
+    ]
+    assert [(group.label, len(group.seeds)) for group in groups(made)] == [
+        ("own:Agent act=<function tanh>", 2),
+        ("own:Agent act=<function relu>", 1),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("task", "named"), [("gym:Arm-v0", "gym:Arm-v0 noise=[1] mass=2 span=[1, 2.5]"), ("my-task", "my-task noise=[1]")]
+)
+def test_settings_that_are_written_differently_are_the_same(tmp_path, task, named):
+    ways = [
+        ({"mass": 2, "span": [1, 2.5]}, {"noise": [1]}, 1, {"stop_at": -200, "init_from": "runs/a"}),
+        ({"span": [1.0, 2.5], "mass": 2.0}, {"noise": [1.0]}, 1.0, {"stop_at": -200.0, "init_from": "runs/a/"}),
+    ]
+    made = []
+    for seed, (constants, faults, gamma, options) in enumerate(ways):
+        of = {"task": task, "constants": constants, "faults": faults, "settings": {"gamma": gamma}, "first": seed}
+        made.append(a_run(tmp_path / str(seed), [flat(1.0)], **of))
+        made[-1].config["options"] |= options
+    assert labels(groups(made)) == [(named, "vrm stop_at=-200 init_from=runs/a", [0, 1])]
+
+
+def test_constants_in_another_order_are_the_same(tmp_path):
+    """They differ from those of a third run, so they are named."""
+    first, other = {"mass": 2, "length": 3}, {"mass": 1, "length": 1}
+    made = [
+        a_run(tmp_path / str(seed), [flat(1.0)], task="my-task", constants=dict(constants), first=seed)
+        for seed, constants in enumerate([first.items(), reversed(first.items()), other.items()])
+    ]
+    assert labels(groups(made)) == [
+        ("my-task length=3 mass=2", "vrm", [0, 1]),
+        ("my-task length=1 mass=1", "vrm", [2]),
+    ]
+
+
 def test_a_seed_run_twice_counts_once_as_far_as_it_went(tmp_path):
     short, long = a_run(tmp_path / "short", [flat(1.0)]), a_run(tmp_path / "long", [flat(1.0, 2.0)])
     for runs in ([short, long], [long, short]):
@@ -151,6 +205,13 @@ def test_runs_are_found_however_deep(tmp_path):
     assert len(find([tmp_path / "sweep", tmp_path / "sweep" / "vrm-seed0"]).runs) == 2
 
 
+@pytest.mark.parametrize("name", ["checkpoints", "metrics", "tensorboard", "wandb"])
+def test_a_run_may_have_any_name_but_inside_a_run_there_are_no_others(tmp_path, name):
+    run = a_run(tmp_path / name, [flat(1.0)])
+    a_run(run.folder / "checkpoints" / "copy", [flat(1.0)])
+    assert [run.folder.name for run in find([tmp_path]).runs] == [name]
+
+
 def test_a_run_that_cannot_be_read_is_left_out_and_named(tmp_path):
     good, bad = a_run(tmp_path / "good", [flat(1.0)]).folder, a_run(tmp_path / "bad", [flat(1.0)]).folder
     (bad / "config.json").write_text("{")
@@ -165,8 +226,9 @@ def test_a_run_that_cannot_be_read_is_left_out_and_named(tmp_path):
 def test_a_run_without_its_logs_is_still_a_run(tmp_path):
     run = a_run(tmp_path / "run", [flat(1.0)])
     shutil.rmtree(run.folder / "metrics")
-    found = find([run.folder])
-    assert len(found.runs) == 1
+    a_run(tmp_path / "other", [flat(1.0)])
+    found = find([tmp_path])
+    assert [run.folder.name for run in found.runs] == ["other", "run"]
     assert "metrics lacks the log of seed 0" in found.damage[0]
 
 
@@ -213,6 +275,15 @@ def test_runs_with_other_options_are_groups_of_their_own_and_a_repetition_is_nam
     assert [group.label for group in made] == ["vrm", "vrm envs=8 precision=bfloat16"]
     (repeated,) = left_out(runs, made)
     assert repeated == f"left out: {tmp_path / 'c'}, seed 0 1: another run has the same settings and seed"
+
+
+def test_a_repetition_that_diverged_is_named_as_such(tmp_path):
+    """The run that went further counts, so a failure would be hidden."""
+    lost = a_run(tmp_path / "a", [flat(1.0), flat(1.0)], diverged=[1])
+    whole = a_run(tmp_path / "b", [flat(1.0, 2.0), flat(1.0, 2.0)])
+    (sentence,) = left_out([lost, whole], groups([lost, whole]))
+    again = f"left out: {lost.folder}, seed 0 1: another run has the same settings and seed"
+    assert sentence == f"{again}. In {lost.folder}, seed 1 diverged"
 
 
 # Aggregates over tasks, against their definitions (Agarwal et al. 2021).

@@ -83,6 +83,12 @@ def test_unfinished_runs_are_listed_and_count_when_asked(tmp_path):
     assert {group["label"]: group["unfinished"] for group in with_them} == {"vrm": False, "slac": True}
 
 
+def test_a_seed_that_diverged_before_its_first_evaluation_does_not_hide_an_unfinished_run(tmp_path):
+    a_folder(tmp_path / "going", [TWO_SEEDS[0][:1], []], diverged=[1])
+    (group,) = page_data(tmp_path, unfinished=True)["groups"]
+    assert group["curves"]["sampled"]["seeds"] == [[1.5], [None]]
+
+
 def test_no_finished_run_makes_a_page_too(tmp_path):
     a_folder(tmp_path / "begun", [[]])
     assert page_data(tmp_path)["groups"] == []
@@ -156,11 +162,11 @@ def test_the_plain_agents_line_is_not_dashed(tmp_path):
     ]
 
 
-def test_settings_are_those_that_differ_from_the_agents(tmp_path):
+def test_settings_are_those_that_differ_from_the_agents_and_all_of_an_own_agent(tmp_path):
     a_folder(tmp_path / "a", TWO_SEEDS, hyperparameters={"gamma": 0.99, "d_size": 7, "policy_layers": [256, 256]})
     a_folder(tmp_path / "b", TWO_SEEDS, agent="vrm-single", hyperparameters={"models": "single"})
     a_folder(tmp_path / "c", TWO_SEEDS, agent="mine:Agent", hyperparameters={"x": 1})
-    assert [run["settings"] for run in page_data(tmp_path)["runs"]] == [["d_size=7"], [], None]
+    assert [run["settings"] for run in page_data(tmp_path)["runs"]] == [["d_size=7"], [], ["x=1"]]
 
 
 def test_a_picture_on_another_drive_has_an_absolute_address(tmp_path, monkeypatch):
@@ -182,6 +188,20 @@ def test_videos_and_curves_are_linked_from_where_the_page_lies(tmp_path):
     page = write_report([tmp_path], tmp_path / "pages" / "page.html").read_text()
     addresses = re.findall(r'"address":"(.*?)"', page)
     assert addresses == [f"../runs/a%20run/{name}" for name in ("curve.png", "videos/seed%200.mp4", "x.gif")]
+
+
+def test_a_page_is_written_while_a_training_removes_its_checkpoints(tmp_path, monkeypatch):
+    run = a_folder(tmp_path / "run", TWO_SEEDS)
+    (run / "checkpoints" / "000001").mkdir(parents=True)
+    scandir = os.scandir
+
+    def removed(path="."):
+        if "checkpoints" in os.fspath(path):
+            raise FileNotFoundError(2, "No such file or directory", path)
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", removed)
+    assert len(page_data(tmp_path)["runs"]) == 1
 
 
 def test_action_repeat_is_named_wherever_the_task_is(tmp_path):

@@ -11,12 +11,14 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from importlib import resources
 
 import pytest
 
 from beliefrl.report import write_report
 from inputs import EVIL, HOUR, TWO_SEEDS, a_folder
 
+NODE = shutil.which("node")
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
 # Chromium reads from file 3 and writes to file 4. A new process sets this up, since a fork would disturb JAX's threads
@@ -239,3 +241,22 @@ def test_a_phone_shows_every_cell_of_every_table_with_its_heading(a_page, width)
         assert page.run(f"getComputedStyle({mean}, '::before').content") == '"return, sampled actions"'
         page.run("document.querySelectorAll('#final thead button')[4].click()")
         assert page.run("document.querySelector('#final [aria-sort]').innerText").startswith("return, sampled actions")
+
+
+@pytest.mark.skipif(NODE is None, reason="there is no Node.js")
+@pytest.mark.parametrize(
+    ("low", "high", "labels"),
+    [
+        (12_500, 12_600, "12.5k 12.55k 12.6k"),
+        (-12_600, -12_500, "-12.6k -12.55k -12.5k"),
+        (1_002_500, 1_002_510, "1.0025M 1.002505M 1.00251M"),
+        (0, 40_000, "0 20k 40k"),
+        (0, 0.2, "0 0.1 0.2"),
+    ],
+)
+def test_ticks_have_all_of_their_digits(low, high, labels):
+    page = "const document = {getElementById: () => ({textContent: '{}'})};"
+    shown = f"console.log(ticks({low}, {high}, 2).map(short).join(' '))"
+    script = "\n".join([page, (resources.files("beliefrl.report") / "curves.js").read_text(encoding="utf-8"), shown])
+    done = subprocess.run([NODE, "-"], input=script, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == labels

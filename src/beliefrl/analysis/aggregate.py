@@ -121,7 +121,7 @@ def bounds(task: str, final: dict[tuple[str, str], np.ndarray]) -> tuple[float, 
 def known_bounds(task: str) -> tuple[float, float] | None:
     """The task's entry in BOUNDS, also for its masked versions and with faults; None without one.
 
-    `task` is the task's name in figures (`groups.task_label`). With other constants the returns have other bounds.
+    `task` is the task's name in figures (`labels.task_label`). With other constants the returns have other bounds.
     """
     name, *changed = task.split()
     if (usual_constants(name) or {}).keys() & {word.partition("=")[0] for word in changed}:

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from beliefrl.analysis.groups import Group, task_label
+from beliefrl.analysis.groups import Group
+from beliefrl.analysis.labels import task_label
 from beliefrl.errors import UserError
 from beliefrl.runs.given_files import check_folder, write_given
 from beliefrl.runs.run import Run
@@ -67,10 +68,16 @@ def axis_label(measure: str) -> str:
     return {"": "return", "success": "success rate"}.get(measure, measure)
 
 
+def mean_of(seeds: np.ndarray) -> np.ndarray:
+    """The mean over the first axis, ignoring NaN; NaN without a value, where NumPy's would warn."""
+    count = np.sum(~np.isnan(seeds), axis=0)
+    return np.where(count, np.nansum(seeds, axis=0) / np.maximum(count, 1), np.nan)
+
+
 def standard_error(seeds: np.ndarray) -> np.ndarray:
     """S.E.M. over the first axis, ignoring NaN; NaN if there is only one value."""
     count = np.sum(~np.isnan(seeds), axis=0)
-    squares = np.nansum((seeds - np.nanmean(seeds, axis=0)) ** 2, axis=0)
+    squares = np.nansum((seeds - mean_of(seeds)) ** 2, axis=0)
     return np.where(count > 1, np.sqrt(squares / np.maximum(count - 1, 1) / np.maximum(count, 1)), np.nan)
 
 
@@ -111,7 +118,7 @@ def curve_figure(run: Run) -> Any:
     for axis, measure in zip(axes, panels, strict=True):
         for mode, colour in COLOURS.items():
             steps, seeds = group.curve(f"{mode}_{measure}" if measure else mode)
-            mean, error = np.nanmean(seeds, axis=0), standard_error(seeds)
+            mean, error = mean_of(seeds), standard_error(seeds)
             for seed in seeds if len(seeds) > 1 else []:
                 axis.plot(steps, seed, color=colour, linewidth=0.6, alpha=0.4)
             axis.plot(steps, mean, color=colour, linewidth=2, label=f"{mode} actions", marker="o", markersize=3)

@@ -9,13 +9,13 @@ from typing import NamedTuple
 import numpy as np
 
 from beliefrl.analysis import results
-from beliefrl.catalogue import usual_constants
+from beliefrl.analysis.labels import differences, options, task_labels
 from beliefrl.errors import UserError
 from beliefrl.runs.given_files import as_path
-from beliefrl.runs.options import Options
-from beliefrl.runs.records import finite_mean, steps_per_action
+from beliefrl.runs.records import finite_mean, is_complete, parsed, steps_per_action
 from beliefrl.runs.run import Row, Run
 
+OF_RUN = ("checkpoints", "metrics", "tensorboard", "wandb")  # folders in a run's folder that contain no runs
 RunSeed = tuple[Run, int]  # a run and one of its seed numbers
 
 
@@ -154,13 +154,17 @@ def _folders(path: pathlib.Path) -> Iterator[pathlib.Path]:
         if real in seen:
             inside.clear()  # a link to a folder above
         else:
-            inside[:] = [name for name in inside if name not in ("checkpoints", "metrics", "tensorboard", "wandb")]
+            if os.path.exists(os.path.join(folder, "config.json")):  # noqa: PTH110, PTH118
+                inside[:] = [name for name in inside if name not in OF_RUN]
             seen.add(real)
             yield pathlib.Path(folder)
 
 
 def _is_run(folder: pathlib.Path) -> bool:
-    return os.path.exists(folder / "config.json") and os.path.isdir(folder / "metrics")  # noqa: PTH110, PTH112
+    """Whether there is a config.json of a training; where it is damaged, the folder of the logs tells."""
+    config = folder / "config.json"
+    has_logs = os.path.isdir(folder / "metrics")  # noqa: PTH112 - pathlib's version raises if a name is too long
+    return os.path.exists(config) and (has_logs or is_complete(parsed(config)))  # noqa: PTH110
 
 
 def is_finished(run: Run) -> bool:
@@ -168,6 +172,11 @@ def is_finished(run: Run) -> bool:
     if _has_stopped(run):
         return True
     return all(run.has_diverged(seed) or last_step(run, seed) >= run.options.steps for seed in run.seeds)
+
+
+def has_begun(run: Run) -> bool:
+    """Whether every seed has been evaluated, or has diverged."""
+    return all(last_step(run, seed) > 0 or run.has_diverged(seed) for seed in run.seeds)
 
 
 def _has_stopped(run: Run) -> bool:
@@ -195,13 +204,13 @@ def groups(
     filled = {agent: usual[agent] | (before or {}).get(agent, {}) for agent in usual}
     settings = {run.folder: filled[run.config["agent"]] | run.config["hyperparameters"] for run in runs}
     seeds: dict[tuple[str, str], dict[int, Run]] = {}
-    names = {run.folder: task_label(run) for run in runs}
+    names = dict(zip([run.folder for run in runs], task_labels(runs), strict=True))
     for run in runs:
         same_agent = [settings[other.folder] for other in runs if other.config["agent"] == run.config["agent"]]
         same_task = [other.config["constants"] for other in runs if names[other.folder] == names[run.folder]]
-        task = " ".join([names[run.folder], *_differences(run.config["constants"], same_task)])
+        task = " ".join([names[run.folder], *sorted(differences(run.config["constants"], same_task))])
         own = results.changed(settings[run.folder], usual[run.config["agent"]])
-        label = " ".join([run.config["agent"], *_differences(own, same_agent), *_options(run)])
+        label = " ".join([run.config["agent"], *differences(own, same_agent), *options(run)])
         of = seeds.setdefault((task, label), {})
         for seed in run.seeds:
             if seed not in of or _precedence(run, seed) > _precedence(of[seed], seed):
@@ -211,34 +220,23 @@ def groups(
     return sorted(merged, key=lambda group: (tasks.index(group.task), labels.index(group.label)))
 
 
-# Options that can change a return.
-OPTIONS = (
-    *("envs", "overlap", "share_env", "init_from", "init_best", "init_replay", "precision", "replay_capacity"),
-    *("stop_at", "stop_patience"),
-)
-
-
-def _options(run: Run) -> list[str]:
-    """NAME=VALUE of these options, if they differ from their defaults."""
-    given = {name: value for name, value in run.config["options"].items() if name in OPTIONS}
-    return [f"{name}={value}" for name, value in given.items() if value != getattr(Options, name)]
-
-
 def left_out(runs: Sequence[Run], shown: Sequence[Group]) -> list[str]:
     """A sentence for each run with seeds that are counted from another run, each group without a curve, and each group
     whose curve ends before the last evaluation of its longest seed.
     """
     counted = {(run.folder, seed) for group in shown for run, seed in group.seeds}
-    missing = [(run.shown, [seed for seed in run.seeds if (run.folder, seed) not in counted]) for run in runs]
-    twice = [
-        f"left out: {folder}, seed {' '.join(map(str, seeds))}: another run has the same settings and seed"
-        for folder, seeds in missing
-        if seeds
-    ]
+    missing = [(run, [seed for seed in run.seeds if (run.folder, seed) not in counted]) for run in runs]
+    twice = [_counted_elsewhere(run, seeds) for run, seeds in missing if seeds]
     without = [
         f"left out: {group.label} on {group.task}: {group.why_no_curve}" for group in shown if group.why_no_curve
     ]
     return twice + without + [why for group in shown if (why := shortened_by(group))]
+
+
+def _counted_elsewhere(run: Run, seeds: Sequence[int]) -> str:
+    shown, lost = (" ".join(map(str, some)) for some in (seeds, filter(run.has_diverged, seeds)))
+    also = f". In {run.shown}, seed {lost} diverged" if lost else ""  # the failure is not hidden
+    return f"left out: {run.shown}, seed {shown}: another run has the same settings and seed{also}"
 
 
 def shortened_by(group: Group) -> str | None:
@@ -259,23 +257,3 @@ def shortened_by(group: Group) -> str | None:
 
 def _precedence(run: Run, seed: int) -> tuple[int, str]:
     return last_step(run, seed), str(run.config.get("started", ""))
-
-
-def task_label(run: Run) -> str:
-    """The name of a task in figures, with selected entries, faults, action repeat and changed constants, if any.
-
-    The default constants of a task of another package are not known, so they do not count as changed.
-    """
-    seen = run.config.get("observe")
-    observed = ["observe", *map(str, seen)] if seen else []
-    faults = [f"{name}={value}" for name, value in run.config.get("faults", {}).items()]
-    constants = run.config["constants"]
-    known = usual_constants(run.config["task"])
-    usual = (constants if known is None else known) | {"steps_per_action": 1, "measures": constants.get("measures")}
-    changed = [f"{name}={value}" for name, value in constants.items() if name not in usual or value != usual[name]]
-    return " ".join([run.config["task"], *observed, *faults, *changed])
-
-
-def _differences(settings: Row, others: Sequence[Row]) -> list[str]:
-    """NAME=VALUE of the settings that differ from some of `others`."""
-    return [f"{name}={value}" for name, value in settings.items() if any(other.get(name) != value for other in others)]

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from beliefrl.analysis.figures import axis_label, figure, save, standard_error
+from beliefrl.analysis.figures import axis_label, figure, mean_of, save, standard_error
 from beliefrl.analysis.groups import Curve, Group, RunSeed
 from beliefrl.analysis.results import MODEL_LOSSES, means_between
 from beliefrl.errors import UserError
@@ -100,7 +100,7 @@ def panels(count: int, labels: Sequence[str]) -> tuple[Any, list[Any]]:
 
 def draw_line(axis: Any, curve: Curve, colour: str, label: str, **style: Any) -> None:
     """Draw the mean of a curve over its seeds, and its S.E.M. as a band; a single evaluation is a dot."""
-    mean, error = np.nanmean(curve.seeds, axis=0), standard_error(curve.seeds)
+    mean, error = mean_of(curve.seeds), standard_error(curve.seeds)
     marker = "o" if len(curve.steps) == 1 else ""
     axis.plot(curve.steps, mean, color=colour, linewidth=1.6, marker=marker, markersize=4, label=label, **style)
     axis.fill_between(curve.steps, mean - error, mean + error, color=colour, alpha=0.2, linewidth=0)

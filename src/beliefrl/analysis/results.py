@@ -42,9 +42,13 @@ class KeptRun(Run):
 
 
 def cut(run: Run, until: int) -> KeptRun:
-    """The run with only the rows up to `until` environment steps. Its time is then unknown."""
-    rows = {seed: [row for row in run.rows(seed) if row["step"] <= until] for seed in run.seeds}
-    is_cut = any(row["step"] > until for seed in run.seeds for row in run.rows(seed))
+    """The run with only the rows up to `until` environment steps. Its time is then unknown.
+
+    Rows of the pre-training are left out, because they count updates.
+    """
+    rows = {seed: [row for row in run.rows(seed) if row["kind"] != "pretrain"] for seed in run.seeds}
+    is_cut = any(row["step"] > until for of_seed in rows.values() for row in of_seed)
+    rows = {seed: [row for row in of_seed if row["step"] <= until] for seed, of_seed in rows.items()}
     timeless = {name: value for name, value in run.config.items() if name not in ("ended", "resumed")}
     return KeptRun(run.folder, timeless if is_cut else run.config, rows)
 

@@ -12,10 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from beliefrl.analysis.aggregate import known_bounds
-from beliefrl.analysis.figures import standard_error
+from beliefrl.analysis.figures import mean_of, standard_error
 from beliefrl.analysis.groups import Curve, Group, last_step
 from beliefrl.analysis.panels import numbers
-from beliefrl.errors import UserError
+from beliefrl.errors import UserError, one_line
 from beliefrl.runs import arrays
 from beliefrl.runs.given_files import check_folder, write_given
 from beliefrl.runs.records import sessions
@@ -74,6 +74,7 @@ def write_table(columns: Sequence[Column], rows: Sequence[Cells], out: pathlib.P
     if not rows:
         raise UserError("The table would be empty: none of these runs has an evaluation there.")
     check_folder(out)
+    rows = [[one_line(cell) for cell in row] for row in rows]  # names in a config.json may have terminal escapes
     write_given(out.with_suffix(".tex"), latex(columns, rows).encode())
     write_given(out.with_suffix(".md"), markdown(columns, rows).encode())
     return out.with_suffix(".md")
@@ -120,12 +121,16 @@ def final_rows(groups: Sequence[Group]) -> list[tuple[str, ...]]:
 
 
 def _final(group: Group, mode: str) -> str:
-    """Mean ± S.E.M. of the seeds that have not diverged, and how many have."""
-    values = group.final(mode)[~group.diverged]
-    if not values.size:
+    """Mean ± S.E.M. of the seeds with a finite return, how many have diverged, and how many returns are not finite."""
+    if group.diverged.all():
         return "diverged"
+    going = group.final(mode)[~group.diverged]
+    values = going[np.isfinite(going)]
+    without = {"diverged": group.diverged.sum(), "not finite": going.size - values.size}
+    lost = "".join(f" ({count} of {len(group.seeds)} {why})" for why, count in without.items() if count)
+    if not values.size:
+        return f"-{lost}"
     error = f" ± {standard_error(values):.1f}" if values.size > 1 else ""
-    lost = f" ({group.diverged.sum()} of {len(group.seeds)} diverged)" if group.diverged.any() else ""
     return f"{values.mean():.1f}{error}{lost}"
 
 
@@ -141,7 +146,7 @@ def _solved(task: str, *curves: Curve) -> str:
     if known is None:
         return "-"
     low, high = known
-    enough = np.any([np.nanmean(curve.seeds, axis=0) >= low + SOLVED * (high - low) for curve in curves], axis=0)
+    enough = np.any([mean_of(curve.seeds) >= low + SOLVED * (high - low) for curve in curves], axis=0)
     return f"{curves[0].steps[np.argmax(enough)]:,}" if enough.any() else "no"
 
 

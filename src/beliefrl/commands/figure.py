@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from beliefrl.commands.arguments import Out, RunFolders, parse, refuse_empty
-from beliefrl.errors import UserError
+from beliefrl.errors import UserError, one_line
 
 KINDS = ("curves", "run", "ablation", "sensitivity", "elbo", "aggregate", "scalability", "table")
 TABLES = ("scalability", "table")
@@ -68,7 +68,7 @@ def figure(argv: Sequence[str]) -> None:
     if kind in TABLES:
         print(path.read_text(encoding="utf-8"), end="")
     for note in notes + more:
-        print(note)
+        print(one_line(note))
     print(f"written to {path} and {path.with_suffix('.tex' if kind in TABLES else '.pdf').name}")
 
 
@@ -102,19 +102,24 @@ def _draw(kind: str, runs: Sequence[Any], out: pathlib.Path, actions: str) -> tu
 def _runs(options: FigureOptions, kind: str) -> tuple[list[Any], list[str]]:
     """The selected runs, and one sentence for each damaged file and each run that is left out."""
     from beliefrl.analysis import groups, results
+    from beliefrl.runs.cached import CachedRun
 
     if not options.runs:
         raise UserError("RUNS is missing: give runs, folders that contain runs, or files of results.")
-    found = groups.find(options.runs)
+    found = groups.find(options.runs, CachedRun)
     chosen = [run for run in found.runs if _is_chosen(run, options, kind)]
-    drawn = [run for run in chosen if options.unfinished or groups.is_finished(run)]
+    begun = [run for run in chosen if groups.has_begun(run)]
+    drawn = begun if options.unfinished else [run for run in begun if groups.is_finished(run)]
     if not drawn:
-        raise UserError(
-            f"None of the {len(found.runs)} runs is both selected and finished: select others, or add --unfinished."
-        )
+        needed, advice = ("finished", ", or add --unfinished") if begun else ("evaluated with every seed", "")
+        raise UserError(f"None of the {len(found.runs)} runs is both selected and {needed}: select others{advice}.")
     notes = [f"damaged: {why}" for why in found.damage]
-    notes += [f"left out: {run.shown} is not finished (--unfinished includes it)" for run in chosen if run not in drawn]
+    notes += [f"left out: {run.shown} {_why_not(run in begun)}" for run in chosen if run not in drawn]
     return drawn if options.until is None else [results.cut(run, options.until) for run in drawn], notes
+
+
+def _why_not(has_begun: bool) -> str:
+    return "is not finished (--unfinished includes it)" if has_begun else "has no evaluation of every seed yet"
 
 
 def _is_chosen(run: Any, options: FigureOptions, kind: str) -> bool:
@@ -146,5 +151,7 @@ def report(argv: Sequence[str]) -> None:
         raise UserError("RUNS is missing: give runs, folders that contain runs, or files of results.")
     from beliefrl.report import write_report
 
-    path = write_report(options.runs, options.out, options.unfinished, lambda sentence: print(f"damaged: {sentence}"))
+    path = write_report(
+        options.runs, options.out, options.unfinished, lambda sentence: print(one_line(f"damaged: {sentence}"))
+    )
     print(f"written to {path}: open it in a browser")

@@ -61,9 +61,10 @@ function ticks(low, high, about) {
   const count = Math.floor(high / step + 1e-9) - first + 1;
   return Array.from({ length: Math.max(count, 0) }, (_, index) => +((first + index) * step).toPrecision(12));
 }
+// All digits of a tick, since ticks that are close to each other must differ
 function short(value) {
-  if (Math.abs(value) >= 1e6) return `${+(value / 1e6).toFixed(2)}M`;
-  return Math.abs(value) >= 1e4 ? `${+(value / 1e3).toFixed(1)}k` : String(value);
+  if (Math.abs(value) >= 1e6) return `${+(value / 1e6).toPrecision(12)}M`;
+  return Math.abs(value) >= 1e4 ? `${+(value / 1e3).toPrecision(12)}k` : String(value);
 }
 
 // An SVG path "M x,y L x,y ..." with gaps where a value is missing

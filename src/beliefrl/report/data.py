@@ -12,7 +12,8 @@ import numpy as np
 
 from beliefrl import agents
 from beliefrl.analysis.figures import standard_error
-from beliefrl.analysis.groups import Curve, Group, groups, is_finished, last_step, shortened_by, task_label
+from beliefrl.analysis.groups import Curve, Group, groups, has_begun, is_finished, last_step, shortened_by
+from beliefrl.analysis.labels import as_text, task_label
 from beliefrl.analysis.panels import colours, dashes
 from beliefrl.analysis.results import changed
 from beliefrl.analysis.tables import wall_clock
@@ -29,9 +30,9 @@ def page_data(runs: Sequence[Run], page_folder: pathlib.Path, unfinished: bool =
     """Everything that the page shows about `runs`; paths of files are relative to the folder `page_folder`.
 
     Curves and final returns include finished runs only. With `unfinished` they also include runs in which each seed has
-    an evaluation; the curve of a group then ends at the last step that all its seeds have reached.
+    an evaluation or has diverged; the curve of a group then ends at the last step that all its seeds have reached.
     """
-    counted = [run for run in runs if is_finished(run) or (unfinished and _has_begun(run))]
+    counted = [run for run in runs if is_finished(run) or (unfinished and has_begun(run))]
     grouped = groups(counted, agents.defaults(), agents.before())
     lines = [group for group in grouped if not group.why_no_curve]
     group_of = {(run.folder, seed): index for index, group in enumerate(lines) for run, seed in group.seeds}
@@ -53,10 +54,6 @@ def page_data(runs: Sequence[Run], page_folder: pathlib.Path, unfinished: bool =
             for run in runs
         ],
     }
-
-
-def _has_begun(run: Run) -> bool:
-    return all(last_step(run, seed) > 0 for seed in run.seeds)
 
 
 def _group(group: Group) -> dict[str, Any]:
@@ -133,13 +130,14 @@ def _run(run: Run, page_folder: pathlib.Path, groups_of: Sequence[int | None]) -
     }
 
 
-def settings(config: dict[str, Any]) -> list[str] | None:
-    """NAME=VALUE of the hyperparameters that differ from the agent's defaults; None if this version lacks the agent."""
-    defaults = agents.defaults().get(config["agent"])
-    if defaults is None:
-        return None
-    known = agents.before()[config["agent"]] | config["hyperparameters"]
-    return [f"{name}={value}" for name, value in changed(known, defaults).items()]
+def settings(config: dict[str, Any]) -> list[str]:
+    """NAME=VALUE of the hyperparameters that differ from the agent's defaults; all if no agent of this name is known.
+
+    An own agent is never known, since it would have to be imported.
+    """
+    defaults = agents.defaults().get(config["agent"], {})
+    known = agents.before().get(config["agent"], {}) | config["hyperparameters"]
+    return [f"{name}={as_text(value)}" for name, value in changed(known, defaults).items()]
 
 
 def _session(session: dict[str, Any]) -> dict[str, str]:
@@ -155,7 +153,12 @@ def _session(session: dict[str, Any]) -> dict[str, str]:
 
 
 def _media(folder: pathlib.Path) -> list[pathlib.Path]:
-    return sorted(path for path in folder.rglob("*") if path.suffix in MEDIA or path == folder / PICTURE)
+    """The videos and the curve in a run's folder. Its checkpoints are not read, since a training may remove them."""
+    found = []
+    for inside, folders, names in os.walk(folder):  # unlike `rglob`, it passes over folders that are removed meanwhile
+        folders[:] = [name for name in folders if name != "checkpoints"]
+        found += [pathlib.Path(inside, name) for name in names]
+    return sorted(path for path in found if path.suffix in MEDIA or path == folder / PICTURE)
 
 
 def _link(folder: pathlib.Path, path: pathlib.Path) -> dict[str, str]:

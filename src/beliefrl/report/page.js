@@ -120,12 +120,7 @@ const UNFINISHED = [
 // Settings: the details of a run are created when the reader opens them
 
 function settings(run) {
-  const changed =
-    run.settings == null
-      ? "(this version does not know the agent)"
-      : run.settings.length
-        ? list(run.settings)
-        : "defaults";
+  const changed = run.settings.length ? list(run.settings) : "defaults";
   const fill = ({ target }) => target.open && target.children.length === 1 && target.append(...runDetails(run));
   return html(
     "details",
