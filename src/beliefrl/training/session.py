@@ -18,7 +18,7 @@ import numpy as np
 
 from beliefrl.agents import Agent
 from beliefrl.analysis.figures import draw_curve
-from beliefrl.errors import UserError, cause
+from beliefrl.errors import Fault, UserError, cause
 from beliefrl.runs.checkpoint import Checkpoints
 from beliefrl.runs.folder import set_aside
 from beliefrl.runs.options import Options
@@ -102,7 +102,7 @@ class Session:
                     for event in events:
                         if self.was_finished or self._listen(event):
                             break
-                except (Stopped, UserError):  # a signal, or an environment that fails
+                except (Stopped, Fault):  # a signal, or an environment that fails
                     with contextlib.suppress(OSError, UserError):  # the checkpoint is there
                         self._finish()
                     raise
