@@ -112,7 +112,10 @@ def test_results_that_are_older_than_the_log_are_said_to_be_so(folder, capsys):
     (run / "results.json").write_text(json.dumps(RESULTS | {"step": 10}))
     main(["show", folder.name])
     command = f"`beliefrl figure table '{folder.name}' --unfinished`"
-    assert f"the log has a later evaluation, of step 20: {command} shows it" in capsys.readouterr().out
+    assert (
+        f"the log has an evaluation of step 20 that is not in results.json: {command} shows it"
+        in capsys.readouterr().out
+    )
 
 
 def test_of_a_run_that_has_only_begun_little_is_shown(folder, capsys):
@@ -125,6 +128,6 @@ def test_of_a_run_that_has_only_begun_little_is_shown(folder, capsys):
     assert shown["checkpoints"] == "none"
     assert shown["initial networks"] == "last agent of runs/first (vrm on pendulum), commit None"
     assert "best agent" not in shown
-    assert "a later evaluation" not in out
+    assert "not in results.json" not in out
     assert "diverged" not in out
     assert "damaged" not in out

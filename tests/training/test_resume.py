@@ -28,6 +28,7 @@ from beliefrl.tasks.gymnasium import GymnasiumTask
 from beliefrl.training import session
 from beliefrl.training.schedule import Phase
 from beliefrl.training.stop import Stopped
+from training.test_host_loop import Late
 from worlds import Counting, CountingAgent, saved
 from wrong import Endless, Fine, Raising
 
@@ -496,21 +497,9 @@ def test_a_training_that_reached_its_line_but_wrote_nothing_begins_again(tmp_pat
     assert resume(run, task=task, agent=agent, progress=False).results()["step"] == 10
 
 
-class Wearing(Fine):
-    """It breaks at its 25th step."""
-
-    taken = 0
-
-    def step(self, action):
-        self.taken += 1
-        if self.taken == 25:
-            raise RuntimeError("the arm is stuck")
-        return super().step(action)
-
-
 def test_the_results_of_a_training_whose_environment_fails_are_those_of_its_last_evaluation(tmp_path, capsys):
-    with pytest.raises(UserError, match="the arm is stuck"):
-        train(CountingAgent(step_start_rl=30), Wearing, tmp_path / "run", **COUNTED)
+    with pytest.raises(UserError, match="the battery is empty"):
+        train(CountingAgent(step_start_rl=30), Late, tmp_path / "run", **COUNTED)
     assert Run(tmp_path / "run").results()["step"] == 20
     assert (tmp_path / "run" / "curve.png").exists()
     main(["show", str(tmp_path / "run")])

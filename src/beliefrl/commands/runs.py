@@ -74,6 +74,7 @@ def show(argv: Sequence[str]) -> None:
     from rich.console import Console
 
     from beliefrl.agents import is_own
+    from beliefrl.analysis.groups import last_step
     from beliefrl.runs.run import Run
     from beliefrl.training.display import results_table, run_table
     from beliefrl.training.restore import agent_of
@@ -87,10 +88,10 @@ def show(argv: Sequence[str]) -> None:
             notes.append(str(error))
     table, results = run_table(run, agent), run.results()
     console.print(table)
-    last = max((row["step"] for seed in run.seeds for row in run.rows(seed, "evaluation")), default=0)
+    last = max(last_step(run, seed) for seed in run.seeds)
     if last > ((results or {}).get("step") or 0):  # it still trains, or was killed
         command = f"`beliefrl figure table {shlex.quote(run.shown)} --unfinished`"
-        notes.append(f"the log has a later evaluation, of step {last:,}: {command} shows it")
+        notes.append(f"the log has an evaluation of step {last:,} that is not in results.json: {command} shows it")
     if results:
         console.print(results_table(results, run.seeds, f"after {results['step']:,} steps"))
     for note in notes:

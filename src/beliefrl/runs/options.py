@@ -106,4 +106,4 @@ class Options:
                 raise UserError(f"track={name} is impossible: it must be {' or '.join(trackers.TRACKERS)}.")
 
 
-NAMES = tuple(field.name for field in dataclasses.fields(Options))
+OPTION_NAMES = tuple(field.name for field in dataclasses.fields(Options))

@@ -27,7 +27,7 @@ from typing import Any
 from beliefrl.errors import UserError, one_line
 from beliefrl.runs import arrays, records
 from beliefrl.runs.best import BEST
-from beliefrl.runs.options import NAMES, Options
+from beliefrl.runs.options import OPTION_NAMES, Options
 from beliefrl.runs.records import Row
 from beliefrl.types import tuples
 
@@ -69,7 +69,7 @@ class Run:
     def options(self) -> Options:
         """The options of the training. Options that only other versions have are left out."""
         given = tuples(self.config["options"])
-        return Options(**{name: value for name, value in given.items() if name in NAMES})
+        return Options(**{name: value for name, value in given.items() if name in OPTION_NAMES})
 
     def __repr__(self) -> str:
         """The folder, the agent and the task: `<Run runs/first: vrm on pendulum-v>`."""

@@ -19,8 +19,7 @@ from beliefrl import agents, tasks
 from beliefrl.catalogue import split_mask
 from beliefrl.errors import UserError
 from beliefrl.runs.folder import folder_name
-from beliefrl.runs.options import NAMES as OPTIONS
-from beliefrl.runs.options import Options
+from beliefrl.runs.options import OPTION_NAMES, Options
 from beliefrl.runs.run import Run
 from beliefrl.sweeps.experiments import Experiment
 from beliefrl.tasks.faults import Faults
@@ -194,7 +193,7 @@ def _split(settings: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any],
     for name in ("seed", "seeds"):
         if name in settings:
             raise UserError(f"{name} cannot be a setting of a sweep: use the argument or option for seeds.")
-    options = {name: value for name, value in settings.items() if name in OPTIONS}
+    options = {name: value for name, value in settings.items() if name in OPTION_NAMES}
     faults = {name: value for name, value in settings.items() if name in FAULTS}
     return {name: value for name, value in settings.items() if name not in options | faults}, options, faults
 

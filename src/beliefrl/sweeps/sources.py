@@ -16,8 +16,9 @@ import numpy as np
 
 from beliefrl.errors import UserError, said
 from beliefrl.runs.arrays import write_whole
+from beliefrl.runs.options import OPTION_NAMES
 from beliefrl.sweeps.experiments import Experiment, grid
-from beliefrl.sweeps.plan import OPTIONS, Training
+from beliefrl.sweeps.plan import Training
 from beliefrl.types import plain
 
 PLAN = "sweep.json"  # in the folder of a sweep
@@ -153,7 +154,7 @@ def read(sweep: pathlib.Path) -> list[Training]:
             raise UserError(f"{path} has format {content['format']}, which this version cannot read: update beliefrl.")
         written = content["trainings"]
         trainings = [Training(**{**each, "observe": tuple(map(str, each["observe"]))}) for each in written]
-        for name in (name for each in trainings for name in each.options if name not in OPTIONS):
+        for name in (name for each in trainings for name in each.options if name not in OPTION_NAMES):
             raise UserError(f"{path} was written by another version: this one has no option {name!r}.")
         return trainings
     except FileNotFoundError:

@@ -11,7 +11,7 @@ from beliefrl.agents import Agent, hyperparameters
 from beliefrl.errors import OfCallback, UserError
 from beliefrl.runs.checkpoint import listed, was_ever_written
 from beliefrl.runs.folder import free_folder
-from beliefrl.runs.options import NAMES, Options
+from beliefrl.runs.options import OPTION_NAMES, Options
 from beliefrl.runs.recorder import Recorder
 from beliefrl.runs.records import provenance
 from beliefrl.runs.run import Run
@@ -224,10 +224,10 @@ def _reporting(run: Run, callback: Callback | None, progress: bool) -> Iterator[
 def _chosen(options: dict[str, Any]) -> Options:
     """The options that were given by name."""
     for name in options:
-        if name not in NAMES:
+        if name not in OPTION_NAMES:
             raise UserError(
-                f"Training has no option {name!r}: it has {', '.join(NAMES)}. Give hyperparameters to make_agent, and "
-                "observe to make_task."
+                f"Training has no option {name!r}: it has {', '.join(OPTION_NAMES)}. Give hyperparameters to "
+                "make_agent, and observe to make_task."
             )
     source = options.get("init_from")
     path = source.shown if isinstance(source, Run) else source
@@ -240,6 +240,6 @@ def _chosen(options: dict[str, Any]) -> Options:
 def _options(run: Run) -> Options:
     """The options that a run was trained with. Raise a UserError if this version lacks one of them."""
     for name in run.config["options"]:
-        if name not in NAMES:
+        if name not in OPTION_NAMES:
             raise UserError(f"{run.shown} was trained by another version: this one has no option {name!r}.")
     return run.options
